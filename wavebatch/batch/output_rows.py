@@ -212,7 +212,13 @@ def assemble_echoes(
     places = np.where(absent, locate(records, layout.source.header), xyz) if absent.any() else xyz
     flags = np.append(table.flags, np.uint16(0))[echo] | reason
     pulse = find_pulses(unit.points["gps_time"])[owner]
-    number, total = _number_rows(pulse, places, direction, records, (flags & np.uint16(dropped)) == 0)
+    # Pulses without any waveform, and rows that are not written, keep the numbers of the input.
+    number, total = (given.astype(np.int64) for given in split_numbers(records))
+    kept = (flags & np.uint16(dropped)) == 0
+    at: Any = slice(None) if kept.all() else np.flatnonzero(kept)
+    numbers, count, known = number_returns(pulse[at], places[at], direction[at])
+    number[at] = np.where(known, numbers, number[at])
+    total[at] = np.where(known, count, total[at])
     flags |= np.where(number > layout.max_return, np.uint16(EchoFlag.RETURN_LIMIT), np.uint16(0))
 
     columns = {**_columns(table, echo, layout, needed), "echo_flags": flags}
@@ -280,18 +286,6 @@ def assemble_returns(
 def _bug(unit: Unit, what: str) -> StageError:
     last = unit.start + len(unit.points) - 1
     return StageError(f"points {unit.start} to {last}: {what}; please report it as a bug")
-
-
-def _number_rows(
-    pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray, records: np.ndarray, counted: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return number and number of returns; pulses without any waveform, and rows not counted, keep the input's."""
-    number, total = (given.astype(np.int64) for given in split_numbers(records))
-    rows: Any = slice(None) if counted.all() else np.flatnonzero(counted)
-    found, count, known = number_returns(pulse[rows], xyz[rows], direction[rows])
-    number[rows] = np.where(known, found, number[rows])
-    total[rows] = np.where(known, count, total[rows])
-    return number, total
 
 
 def _columns(

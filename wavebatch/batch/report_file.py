@@ -299,13 +299,22 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += filter(None, [prepared.sensor.doubt()])
     lines += prepared.job.calibration.notes if prepared.job.calibration else ()
     lines += _find_gaps(prepared.sensor, report.no_data)
-    lines += _doubt_units(prepared)
+    # An aircraft that is too fast: its strip may be in feet without saying so.
+    facts = dict(prepared.sensor.facts)
+    named = any(unit.horizontal is not None for unit in prepared.facts.units)
+    fast = prepared.sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST
+    if fast and not (named and facts.get("height_m", 0.0) > JETS):
+        lines.append(
+            f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
+            f"{facts['height_m']:.0f} m above the points, whatever a CRS says: are they in feet? Then ranges are "
+            "3.28 times too long: project the strip to metres"
+        )
     height, sensor = prepared.job.sensor.height, prepared.sensor
     if height is not None and sensor.height is None:
-        seen = dict(sensor.facts).get("height_m")
+        seen = facts.get("height_m")
         where = f": {seen:.0f} m above the points" if seen else ""
         lines.append(f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}")
-    unseen = 0.0 if sensor.kind == "trajectory" else dict(sensor.facts).get("turned_error_deg", 0.0)
+    unseen = 0.0 if sensor.kind == "trajectory" else facts.get("turned_error_deg", 0.0)
     second = prepared.second_step
     if second is not None and "incidence_angle_normals" in second.stage.makes and unseen > UNSEEN_TURN:
         lines.append(
@@ -317,7 +326,16 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     if step.effective().get("model") == "auto":
         fitted = loop_model(prepared.system, "auto")
         lines.append(f'{step.stage.name} fits the pulse of the survey: model = "{fitted}"')
-    lines += _name_raised(prepared)
+    # A threshold of the residual loop that lies below the noise, which the stage takes in its place.
+    if step.stage.name == "decompose.residual_loop":
+        given, survey = step.effective(), prepared.choice.survey
+        noise = survey.system.noise.std
+        unit = {"count": 1.0, "amplitude": survey.figures.amplitude_50 or 0.0}.get(given["t_unit"], 0.0)
+        if 0 < unit * given["t_diff"] < noise:
+            lines.append(
+                f"decompose.residual_loop: t_diff = {given['t_diff']:g} (unit {given['t_unit']}) lies below the noise "
+                f"of {noise:.2f} DN and was raised to it"
+            )
     last, lost = report.last_left_out, report.left_out.get("where", 0)
     if last:
         lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
@@ -329,7 +347,6 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             continue
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
-            total = sum(counts.values())
             first = max(NoData, key=lambda reason: (counts.get(reason.name, 0), -reason))
             meaning, remedy = REASONS[first]
             share = f"{counts[first.name]} of them: " if counts[first.name] < total else ""
@@ -385,7 +402,18 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         lines = doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
         found += warn("foreign-packets", lines)
     found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()
-    found += () if choice.doubted else warn("failed-fits", _doubt_fits(prepared, report))
+    # Flags of failed fits that far more echoes have than usual.
+    written = report.count("points_out") - sum(report.passed_through.values())
+    for flag in (EchoFlag.NOT_CONVERGED, EchoFlag.AT_BOUND):
+        number = report.flags.get(str(flag.name), 0)
+        if not choice.doubted and written >= LEAST_JUDGED and number > MOST_FAILED * written:
+            auto = prepared.job.request.describe() is not None
+            remedy = "draw some with `wavebatch plot waveform --flags`" if auto else "use --profile auto"
+            line = (
+                f"{number} of {written} echoes ({100 * number / written:.0f} %) are {flag.name}, far more than usual: "
+                f"their errors cannot be trusted; {remedy}, or leave them out with --drop-flags {flag.name}"
+            )
+            found += warn("failed-fits", [line])
     # More reflectances above 1 than metal, signs and wet roofs explain.
     known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
     if report.above_one > MOST_ABOVE_ONE * known > 0:
@@ -405,34 +433,6 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         found += warn("false-echoes", [line])
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
-
-
-def _name_raised(prepared: Prepared) -> Iterator[str]:
-    """A threshold of the residual loop that lies below the noise, which the stage takes in its place."""
-    step, survey = prepared.choice.chain.steps[2], prepared.choice.survey
-    if step.stage.name != "decompose.residual_loop":
-        return
-    given, noise = step.effective(), survey.system.noise.std
-    unit = {"count": 1.0, "amplitude": survey.figures.amplitude_50 or 0.0}.get(given["t_unit"], 0.0)
-    if 0 < unit * given["t_diff"] < noise:
-        yield (
-            f"decompose.residual_loop: t_diff = {given['t_diff']:g} (unit {given['t_unit']}) lies below the noise of "
-            f"{noise:.2f} DN and was raised to it"
-        )
-
-
-def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A line for each flag of failed fits that far more echoes have than usual."""
-    written = report.count("points_out") - sum(report.passed_through.values())
-    for flag in (EchoFlag.NOT_CONVERGED, EchoFlag.AT_BOUND):
-        number = report.flags.get(str(flag.name), 0)
-        if written >= LEAST_JUDGED and number > MOST_FAILED * written:
-            auto = prepared.job.request.describe() is not None
-            remedy = "draw some with `wavebatch plot waveform --flags`" if auto else "use --profile auto"
-            yield (
-                f"{number} of {written} echoes ({100 * number / written:.0f} %) are {flag.name}, far more than usual: "
-                f"their errors cannot be trusted; {remedy}, or leave them out with --drop-flags {flag.name}"
-            )
 
 
 def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
@@ -468,20 +468,6 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield (
             f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
             "value: leave these points out before a mean (flag ADDED)"
-        )
-
-
-def _doubt_units(prepared: Prepared) -> Iterator[str]:
-    """An aircraft that is too fast: its strip may be in feet without saying so."""
-    facts = dict(prepared.sensor.facts)
-    named = any(unit.horizontal is not None for unit in prepared.facts.units)
-    if named and facts.get("height_m", 0.0) > JETS:
-        return
-    if prepared.sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST:
-        yield (
-            f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
-            f"{facts['height_m']:.0f} m above the points, whatever a CRS says: are they in feet? Then ranges are "
-            "3.28 times too long: project the strip to metres"
         )
 
 

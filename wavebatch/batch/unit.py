@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import pickle
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -349,7 +349,14 @@ def solve_unit(
         timing["read points"] = Seconds.now() - start
         blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
         system, solved = prepared.system, []
-        for block, index in _timed(blocks, timing, "read packets"):
+        timing["read packets"] = Seconds()
+        while True:
+            start = Seconds.now()
+            found = next(blocks, None)
+            timing["read packets"] += Seconds.now() - start
+            if found is None:
+                break
+            block, index = found
             placed = prepared.sensor.fill(block)
             if prepared.pulse_energy is not None:
                 placed = prepared.pulse_energy.fill(placed, unit)
@@ -405,18 +412,6 @@ def _block_size(unit: Unit, wanted: int | None) -> int:
     longest = int(unit.packets.n_samples.max(initial=1))
     most = max(min(BLOCK_SAMPLES // longest, 65536), 1)
     return most if wanted is None else min(most, max(wanted * USUAL_SAMPLES // longest, 1), wanted)
-
-
-def _timed(items: Iterator, timing: dict[str, Seconds], name: str) -> Iterator:
-    """The items; the seconds that they take are added to timing[name]."""
-    timing[name] = Seconds()
-    while True:
-        start = Seconds.now()
-        item = next(items, None)
-        timing[name] += Seconds.now() - start
-        if item is None:
-            return
-        yield item
 
 
 Part = tuple[RowParcel, int, int]

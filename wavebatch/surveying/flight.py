@@ -208,15 +208,9 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
         for sample, strip in zip(samples, held, strict=True)
         if strip.fits and strip.look is not None and strip.look.width and sum(map(len, sample.blocks)) >= HELD
     }
-    identity = {"strips": [_identify(sample.fingerprint, sample.path in compared) for sample in group]}
+    identity = {"strips": [{**sample.fingerprint, "compared": sample.path in compared} for sample in group]}
     name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
     return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(held))
-
-
-def _identify(fingerprint: Mapping[str, Any], compared: bool) -> dict[str, Any]:
-    """A strip of a flight by its content; compared: it gave HELD waveforms to the survey, and their echoes are
-    the flight's."""
-    return {**fingerprint, "compared": compared}
 
 
 def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str:
@@ -243,7 +237,7 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str
     whole, kinds = read_flight(flight.survey)
     fingerprint = take_fingerprint(reader.facts.path, reader.facts.packets.file)
     surveyed = flight.fingerprint.get("strips")
-    if isinstance(surveyed, list) and _identify(fingerprint, compared=True) in surveyed:
+    if isinstance(surveyed, list) and {**fingerprint, "compared": True} in surveyed:
         return ""
     number = min(HELD, sample_size(reader, scan))
     sample = StripSample(reader.facts.path, fingerprint, tuple(reader.sample_blocks(scan, number)))

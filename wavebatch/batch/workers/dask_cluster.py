@@ -287,7 +287,14 @@ def connected(address: str) -> Iterator[Any]:
     from distributed.security import Security
 
     try:
-        _knock(address)
+        # A client that fails can hang and leave threads.
+        scheme, separator, place = address.rpartition("://")
+        if separator and scheme not in _SCHEMES:
+            raise ValueError(f"no scheduler has an address of the kind {scheme}://; known are {', '.join(_SCHEMES)}")
+        host, _, port = place.rpartition(":")
+        if not host or not port.isdigit():
+            raise ValueError("it has no host and port")
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT).close()
         # A client that fails prints more when it ends; one that waits too long goes on in its thread.
         if address.startswith("tls://") and Security().get_connection_args("client").get("ssl_context") is None:
             what = "no certificate and key here (distributed.comm.tls in its configuration)"
@@ -306,17 +313,6 @@ def connected(address: str) -> Iterator[Any]:
     finally:
         with contextlib.suppress(Exception):
             client.close(timeout=_CLOSE)
-
-
-def _knock(address: str) -> None:
-    """Raise OSError or ValueError where no scheduler listens; a client that fails can hang and leave threads."""
-    scheme, separator, place = address.rpartition("://")
-    if separator and scheme not in _SCHEMES:
-        raise ValueError(f"no scheduler has an address of the kind {scheme}://; known are {', '.join(_SCHEMES)}")
-    host, _, port = place.rpartition(":")
-    if not host or not port.isdigit():
-        raise ValueError("it has no host and port")
-    socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT).close()
 
 
 @contextlib.contextmanager

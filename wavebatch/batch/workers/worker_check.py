@@ -78,14 +78,13 @@ def list_sizes(files: Sequence[str]) -> list[int]:
     -------
     list of int
     """
-    return [_size(file) for file in files]
-
-
-def _size(file: str) -> int:
-    try:
-        return os.path.getsize(file)
-    except (OSError, ValueError):
-        return -1
+    sizes = []
+    for file in files:
+        try:
+            sizes.append(os.path.getsize(file))
+        except (OSError, ValueError):
+            sizes.append(-1)
+    return sizes
 
 
 _PROBE = "from wavebatch.batch.workers.worker_check import probe_arithmetic; print(probe_arithmetic())"
@@ -111,7 +110,12 @@ def describe_processor() -> dict[str, str]:
     ----------
     docs/reliability.md, "The same bytes".
     """
-    return {"name": _find_name(), "probe": _probe_alone()}
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return {"name": name, "probe": _probe_alone()}
 
 
 @functools.lru_cache(maxsize=1)
@@ -151,12 +155,3 @@ def probe_arithmetic() -> str:
             for result in results:
                 digest.update(np.ascontiguousarray(result).tobytes())
     return digest.hexdigest()[:16]
-
-
-def _find_name() -> str:
-    """The model of the processor, as well as the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()

@@ -112,7 +112,10 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
     for number in range(_ROUNDS):
         if not len(active):
             break
-        rows, local = _rows_of(active, count)
+        # Rows of the points of active sets, and to which of these sets each belongs.
+        many = count[active]
+        local = np.repeat(np.arange(len(active)), many)
+        rows = np.arange(len(local)) + ((np.cumsum(count) - count)[active] - (np.cumsum(many) - many))[local]
         at = group[rows]
         off = (x[0][rows] - centre[at, 0]) * axes[at, 0, 0]
         off += (x[1][rows] - centre[at, 1]) * axes[at, 1, 0]
@@ -201,15 +204,6 @@ def _solve(moments: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarra
         covariance[:, a, b] = covariance[:, b, a] = total / number - centre[:, a] * centre[:, b]
     spreads, axes = np.linalg.eigh(covariance)
     return centre, spreads, axes
-
-
-def _rows_of(sets: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the points of some sets (ascending), and to which of these sets each belongs."""
-    start = np.cumsum(count) - count
-    number = count[sets]
-    local = np.repeat(np.arange(len(sets)), number)
-    begin = np.cumsum(number) - number
-    return np.arange(len(local)) + (start[sets] - begin)[local], local
 
 
 def _medians(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
@@ -329,7 +323,9 @@ def compare_halves(offset: np.ndarray, point: np.ndarray, planes: Planes) -> Hal
     (docs/algorithms.md 1.4). A half without a plane (fewer than four points, or in line) makes its cut impossible.
     """
     n = len(planes.kept)
-    flat = [_project(offset, planes.axes[:, :, axis], point) for axis in (2, 1, 0)]
+    x, y, z = offset.T
+    axes = (planes.axes[point, :, axis].T for axis in (2, 1, 0))
+    flat = [x * east + y * north + z * up for east, north, up in axes]
     flat[2] -= np.einsum("ni,ni->n", planes.centre, planes.normal)[point]
     near = np.abs(flat[2]) <= planes.limit[point]
     u, v, r = (part[near] for part in flat)
@@ -404,10 +400,6 @@ def misfit_of_angles(halves: Halves, planes: Planes, ray: np.ndarray) -> np.ndar
 
 def _angle_of(cosine: np.ndarray) -> np.ndarray:
     return np.arccos(np.minimum(np.abs(cosine), 1.0))
-
-
-def _project(offset: np.ndarray, axis: np.ndarray, point: np.ndarray) -> np.ndarray:
-    return offset[:, 0] * axis[point, 0] + offset[:, 1] * axis[point, 1] + offset[:, 2] * axis[point, 2]
 
 
 def _fit(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -72,7 +72,30 @@ def closed_form(
     Guo (2011); docs/algorithms.md 4.1.
     """
     fit = FitOptions(tolerance=0.1, max_iterations=steps + 1, **limits)
-    start = _start_closed_form(block, noise, system, echoes, fraction, (fit.least_width, fit.most_width))
+    ref = system.sigma_ref / block.spacing
+    waveform = echoes.waveform.astype(np.int64)
+    s = block.samples.shape[1]
+    peak = np.clip(np.rint(echoes.time / block.spacing), 0, s - 1).astype(np.int64)
+    reach = min(int(np.ceil(2.5 * ref)), s)
+    step = max(CLOSED_VALUES // (2 * reach + 1), 2)
+    found = []
+    for begin in range(0, max(len(waveform), 1), step):
+        # Signal above the baseline around peaks; 0 where no sample was recorded.
+        row, at = waveform[begin : begin + step, None], peak[begin : begin + step, None] + np.arange(-reach, reach + 1)
+        inside = (at >= 0) & (at < s)
+        at = np.clip(at, 0, s - 1)
+        y = block.samples[row, at] - (noise.baseline[row] if noise.of_sample is None else noise.of_sample[row, at])
+        if block.missing is not None:
+            inside &= ~block.missing[row, at]
+        found.append(fit_closed_form(np.where(inside, y, 0.0), fraction))
+    amplitude, shift, width, holds = (np.concatenate(fields) for fields in zip(*found, strict=True))
+    holds &= (width > fit.least_width * ref) & (width < fit.most_width * ref)
+    start = replace(
+        echoes,
+        amplitude=np.where(holds, amplitude, echoes.amplitude).astype(np.float32),
+        time=np.where(holds, (peak + shift) * block.spacing, echoes.time),
+        sigma=np.where(holds, width * block.spacing, echoes.sigma).astype(np.float32),
+    )
     settings = make_settings(block, system, GAUSSIAN, fit, grow=False)
     return fit_candidates(block, noise, system, start, settings, significance=fit.significance, most=1)
 
@@ -166,41 +189,6 @@ def adaptive(
     )
     significance = max(fit.significance, system.significance)
     return fit_candidates(block, noise, system, echoes, settings, significance=significance)
-
-
-def _start_closed_form(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    fraction: float,
-    widths: tuple[float, float],
-) -> EchoTable:
-    """Candidates with amplitude, time and width of the closed form, where it is valid."""
-    ref = system.sigma_ref / block.spacing
-    waveform = echoes.waveform.astype(np.int64)
-    s = block.samples.shape[1]
-    peak = np.clip(np.rint(echoes.time / block.spacing), 0, s - 1).astype(np.int64)
-    reach = min(int(np.ceil(2.5 * ref)), s)
-    step = max(CLOSED_VALUES // (2 * reach + 1), 2)
-    found = []
-    for begin in range(0, max(len(waveform), 1), step):
-        # Signal above the baseline around peaks; 0 where no sample was recorded.
-        row, at = waveform[begin : begin + step, None], peak[begin : begin + step, None] + np.arange(-reach, reach + 1)
-        inside = (at >= 0) & (at < s)
-        at = np.clip(at, 0, s - 1)
-        y = block.samples[row, at] - (noise.baseline[row] if noise.of_sample is None else noise.of_sample[row, at])
-        if block.missing is not None:
-            inside &= ~block.missing[row, at]
-        found.append(fit_closed_form(np.where(inside, y, 0.0), fraction))
-    amplitude, shift, width, holds = (np.concatenate(fields) for fields in zip(*found, strict=True))
-    holds &= (width > widths[0] * ref) & (width < widths[1] * ref)
-    return replace(
-        echoes,
-        amplitude=np.where(holds, amplitude, echoes.amplitude).astype(np.float32),
-        time=np.where(holds, (peak + shift) * block.spacing, echoes.time),
-        sigma=np.where(holds, width * block.spacing, echoes.sigma).astype(np.float32),
-    )
 
 
 def loop_model(system: SystemPulse, model: str) -> str:

@@ -124,7 +124,25 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None, righ
             empty.astype(int), empty.astype(int), empty, empty, empty, empty, np.empty((0, 2)), size, np.empty(0, VIEW)
         )
     _, cell = np.unique(cell, return_inverse=True)
-    off, facing, tilt, flat = _fit_cells(rows, cell, np.unique(pair, return_inverse=True)[1], slope)
+    # The plane goes through the echoes of every source less their mean: strips that lie over each other by a step
+    # have the same slope, and the step shows in the heights.
+    of = np.unique(pair, return_inverse=True)[1]
+    xyz = rows["xyz"].astype(np.float64)
+    local, n = xyz - _means(xyz, of)[of], int(cell[-1]) + 1
+    planes = fit_planes(local, cell, n)
+    normal = planes.normal * np.where(planes.normal[:, 2:] < 0, -1.0, 1.0)
+    along = np.einsum("ij,ij->i", local - planes.centre[cell], normal[cell])
+    facing = np.abs(np.einsum("ij,ij->i", rows["ray"].astype(np.float64), normal[cell]))
+    flat = (planes.spreads[:, 0] < MOST_SCATTER**2) & (planes.kept >= LEAST_KEPT * np.bincount(cell, minlength=n))
+    # The plane must be known in two directions: scan lines of one strip may cross a cell in one line.
+    flat &= planes.spreads[:, 1] > np.maximum(25.0 * planes.spreads[:, 0], 1e-4)
+    tilt = np.arccos(np.clip(normal[:, 2], 0.0, 1.0))
+    if slope is not None:
+        flat &= tilt <= slope
+    on = np.abs(along) <= planes.limit[cell]
+    off = np.einsum("ij,ij->i", xyz - _means(xyz, cell)[cell], normal[cell]) / np.maximum(normal[cell, 2], 0.1)
+    tilt = tilt[cell]
+    flat = flat[cell] & on & (facing > np.cos(STEEPEST))
     with np.errstate(divide="ignore", invalid="ignore"):
         value = np.log(rows["light"].astype(np.float64) / (4.0 * facing))
     good = flat & np.isfinite(value)
@@ -160,31 +178,6 @@ def _keep_shared(rows: np.ndarray, cell: np.ndarray, *more: np.ndarray) -> tuple
     keep = enough[of] & (sources[cell] >= 2)
     order = np.flatnonzero(keep)[np.argsort(pair[keep], kind="stable")]
     return rows[order], cell[order], pair[order], *(values[order] for values in more)
-
-
-def _fit_cells(
-    rows: np.ndarray, cell: np.ndarray, pair: np.ndarray, slope: float | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Height over the plane of its cell [m], cosine of the incidence, slope [rad], and whether to use it, of each row.
-
-    The plane goes through the echoes of every source less their mean: strips that lie over each other by a step have
-    the same slope, and the step shows in the heights.
-    """
-    xyz = rows["xyz"].astype(np.float64)
-    local, n = xyz - _means(xyz, pair)[pair], int(cell[-1]) + 1
-    planes = fit_planes(local, cell, n)
-    normal = planes.normal * np.where(planes.normal[:, 2:] < 0, -1.0, 1.0)
-    along = np.einsum("ij,ij->i", local - planes.centre[cell], normal[cell])
-    facing = np.abs(np.einsum("ij,ij->i", rows["ray"].astype(np.float64), normal[cell]))
-    flat = (planes.spreads[:, 0] < MOST_SCATTER**2) & (planes.kept >= LEAST_KEPT * np.bincount(cell, minlength=n))
-    # The plane must be known in two directions: scan lines of one strip may cross a cell in one line.
-    flat &= planes.spreads[:, 1] > np.maximum(25.0 * planes.spreads[:, 0], 1e-4)
-    tilt = np.arccos(np.clip(normal[:, 2], 0.0, 1.0))
-    if slope is not None:
-        flat &= tilt <= slope
-    on = np.abs(along) <= planes.limit[cell]
-    height = np.einsum("ij,ij->i", xyz - _means(xyz, cell)[cell], normal[cell]) / np.maximum(normal[cell, 2], 0.1)
-    return height, facing, tilt[cell], flat[cell] & on & (facing > np.cos(STEEPEST))
 
 
 def _means(xyz: np.ndarray, group: np.ndarray) -> np.ndarray:

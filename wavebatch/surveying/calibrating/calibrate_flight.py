@@ -444,11 +444,16 @@ def calibrate_flight(
     calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath)
     names = [source.name for source in sources]
     pairs = tuple(compare_pairs(ties, adjusted, names))
-    lost = [
-        source.name
-        for source, value in zip(sources, adjusted.value, strict=True)
-        if not (np.isfinite(value) or _is_covered(source.row, calibration.channels))
-    ]
+    lost = []
+    for source, value in zip(sources, adjusted.value, strict=True):
+        # A run takes the constant of other channels for one that differs in its samples per waveform only.
+        row = source.row
+        kind = (row.scanner, row.bits, row.spacing_ns, row.gain)
+        channels = calibration.channels
+        alike = [one for one in channels if (one.scanner, one.bits, one.spacing_ns, one.gain) == kind]
+        covered = alike and all(one.samples != row.samples for one in alike)
+        if not (np.isfinite(value) or covered):
+            lost.append(source.name)
     notes = [*calibration.notes, *find_doubts(lost, calibration.strips, pairs)]
     # What the overlaps leave unexplained is in the errors; where it is more than these, it is said.
     trend, more = find_trend(ties, anchors, seen, adjusted), []
@@ -467,18 +472,6 @@ def calibrate_flight(
             f"error of the constants grows by {100 * open_error:.1f} %; give three strips, one of another heading"
         )
     return FlightCalibration(replace(calibration.widened(bent), notes=(*notes, *more)), pairs, ties.size)
-
-
-def _is_covered(row: ChannelConstant, channels: Sequence[ChannelConstant]) -> bool:
-    """Whether a run takes the constant of other channels for this one, which differs in its samples per waveform only:
-    see `strip_match`."""
-    alike = [
-        other
-        for other in channels
-        if (other.scanner, other.bits, other.spacing_ns, other.gain)
-        == (row.scanner, row.bits, row.spacing_ns, row.gain)
-    ]
-    return bool(alike) and all(other.samples != row.samples for other in alike)
 
 
 def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions) -> float:

@@ -274,10 +274,14 @@ def measure_setting(
     rate = _measure_rate(reader)
     every = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
     zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
-    brightest = {channel: float(np.quantile(rows[1], BRIGHT)) for channel, rows in known.items()}
-    scenes = {channel: _describe_scene(rows[1]) for channel, rows in known.items()}
-    places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
-    fading = [NO_CHANGE, *(_find_fading(rows[0], rows[1], rows[2:4], chance=chance) for rows in known.values())]
+    brightest, scenes, places, fading = {}, {}, {}, [NO_CHANGE]
+    for channel, rows in known.items():
+        time, light, east, north = rows[:4]
+        brightest[channel] = float(np.quantile(light, BRIGHT))
+        scenes[channel] = _describe_scene(light)
+        off = time - 0.5 * (time.min() + time.max())
+        places[channel] = np.stack([east, north, np.log(light), off / max(float(off.max()), 1e-9)])
+        fading.append(_find_fading(time, light, rows[2:4], chance=chance))
     fades = max(fading, key=lambda one: one.error)
     right = (0.0, 0.0)  # by the mean motion of the sensor; 0 where it does not move
     if every.size:
@@ -383,11 +387,6 @@ def keep_places(places: Mapping[_Channel, np.ndarray]) -> tuple[float, ...]:
     ]
     joined = np.concatenate([np.empty((0, 4)), *parts])
     return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
-
-
-def _list_places(east: np.ndarray, north: np.ndarray, light: np.ndarray, time: np.ndarray) -> np.ndarray:
-    place = time - 0.5 * (time.min() + time.max())
-    return np.stack([east, north, np.log(light), place / max(float(place.max()), 1e-9)])
 
 
 def _describe_scene(light: np.ndarray) -> tuple[float, ...]:
