@@ -340,7 +340,21 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     if last:
         lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
                      "the ground: return numbers stay those of the whole pulse")  # fmt: skip
-    lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
+    layout, added = prepared.layout, report.count("added_echoes")
+    lines += [*layout.notes, *describe_roundings(layout.written)]
+    if added and layout.copied:
+        lines.append(
+            f"{', '.join(layout.copied)}: kept; {added} added echoes have the value of the nearest return of their "
+            "packet, because no value is free for no-data"
+        )
+    marked = [f"{one.record.name} {one.record.no_data[0]:g}" for one in layout.carried
+              if not (one.copied or layout.whole or one.record.no_data is None)
+              and math.isfinite(one.record.no_data[0])]  # fmt: skip
+    if added and marked:
+        lines.append(
+            f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
+            "value: leave these points out before a mean (flag ADDED)"
+        )
     wanted = {*prepared.job.columns, *prepared.needed}
     for column, counts in sorted(report.no_data.items()):
         if column not in wanted:
@@ -393,7 +407,21 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         place = prepared.chosen.chosen.describe_extent(prepared.facts.header)
         line = f"no point is written: of {left_out}, {reasons}{place and '; ' + place}"
         found += warn("nothing-selected", [line])
-    found += warn("empty", _find_nothing(prepared, report))
+    points, waveforms, nothing = report.count("points_in"), report.count("waveforms"), ""
+    if not points:
+        nothing = "the strip has no points, so its cloud has none; if it should have some, get the file again"
+    elif not waveforms:
+        nothing = f"none of {points} points has a waveform: all are written unchanged, without attributes"
+    elif waveforms >= LEAST_JUDGED and not echoes:
+        figures, noise = choice.survey.figures, prepared.system.noise
+        down = 0.0 if figures.least_count is None else noise.baseline - figures.least_count
+        up = 0.0 if figures.largest_count is None else figures.largest_count - noise.baseline
+        reason = "nothing rises far enough above the noise"
+        if down > INVERTED * max(up, noise.std):
+            reason = f"the signal falls from {noise.baseline:.0f} to {noise.baseline - down:.0f} DN: it is inverted"
+        nothing = f"none of {waveforms} waveforms holds an echo: {reason}"
+        nothing += "; `wavebatch survey` shows what the strip records"
+    found += warn("empty", filter(None, [nothing]))
     # Packets of another strip, by --force, and return locations that fit no echo.
     if prepared.scan.stranger:
         found += warn("foreign-packets", [f"--force: {prepared.scan.stranger}"])
@@ -433,42 +461,6 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         found += warn("false-echoes", [line])
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
-
-
-def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A strip without any point, waveform or echo: its cloud is empty, or has no attributes."""
-    points, waveforms, echoes = (report.count(name) for name in ("points_in", "waveforms", "echoes"))
-    if not points:
-        yield "the strip has no points, so its cloud has none; if it should have some, get the file again"
-    elif not waveforms:
-        yield f"none of {points} points has a waveform: all are written unchanged, without attributes"
-    elif waveforms >= LEAST_JUDGED and not echoes:
-        figures, noise = prepared.choice.survey.figures, prepared.system.noise
-        least, largest = figures.least_count, figures.largest_count
-        down = 0.0 if least is None else noise.baseline - least
-        up = 0.0 if largest is None else largest - noise.baseline
-        reason = "nothing rises far enough above the noise"
-        if down > INVERTED * max(up, noise.std):
-            reason = f"the signal falls from {noise.baseline:.0f} to {noise.baseline - down:.0f} DN: it is inverted"
-        yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
-
-
-def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """Extra bytes of the input that added echoes share with the nearest return."""
-    added = report.count("added_echoes")
-    if added and prepared.layout.copied:
-        yield (
-            f"{', '.join(prepared.layout.copied)}: kept; {added} added echoes have the value of the nearest return of "
-            "their packet, because no value is free for no-data"
-        )
-    marked = [f"{one.record.name} {one.record.no_data[0]:g}" for one in prepared.layout.carried
-              if not (one.copied or prepared.layout.whole or one.record.no_data is None)
-              and math.isfinite(one.record.no_data[0])]  # fmt: skip
-    if added and marked:
-        yield (
-            f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
-            "value: leave these points out before a mean (flag ADDED)"
-        )
 
 
 def _find_gaps(sensor: SensorSource, no_data: Mapping[str, Mapping[str, int]]) -> Iterator[str]:

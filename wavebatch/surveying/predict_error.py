@@ -163,18 +163,7 @@ def simulate_again(
     # Rounding to whole counts, below, adds this part of the noise again.
     white = max(system.noise.std**2 - QUANTISATION_STD**2, 0.0)
     variance = white + system.noise.gain * np.maximum(signal, 0)
-    signal += np.sqrt(variance).astype(np.float32) * _draw_noise(rng, n, s, system)
-    signal += system.noise.baseline + system.noise.baseline_spread * rng.standard_normal((n, 1))
-    top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
-    # In double precision: 2^32 - 1 in single precision is 2^32, which no sample of 32 bits can hold.
-    counts = np.clip(np.rint(signal.astype(np.float64)), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
-    trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
-    plain = replace(system, defects=Defects())
-    return replace(trial, digitizer=replace(block.digitizer, n_samples=s)), plain
-
-
-def _draw_noise(rng: np.random.Generator, n: int, s: int, system: SystemPulse) -> np.ndarray:
-    """Noise that fits of this system see with a standard deviation of 1: coloured where they whiten it, f4 (n, s)."""
+    # Noise that fits of this system see with a standard deviation of 1: coloured where they whiten it.
     noise = rng.standard_normal((n, s), dtype=np.float32)
     if system.noise.whitening:
         rows = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet).astype(np.float32)
@@ -183,7 +172,14 @@ def _draw_noise(rng: np.random.Generator, n: int, s: int, system: SystemPulse) -
             for j in range(1, before + 1):
                 noise[:, i] -= rows[before, j] * noise[:, i - j]
             noise[:, i] /= rows[before, 0]
-    return noise
+    signal += np.sqrt(variance).astype(np.float32) * noise
+    signal += system.noise.baseline + system.noise.baseline_spread * rng.standard_normal((n, 1))
+    top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
+    # In double precision: 2^32 - 1 in single precision is 2^32, which no sample of 32 bits can hold.
+    counts = np.clip(np.rint(signal.astype(np.float64)), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
+    trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
+    plain = replace(system, defects=Defects())
+    return replace(trial, digitizer=replace(block.digitizer, n_samples=s)), plain
 
 
 def _rms(values: np.ndarray) -> float:

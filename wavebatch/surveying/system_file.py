@@ -14,7 +14,7 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.core.frozen import frozen
 from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml
+from wavebatch.files.toml_file import format_toml, parse_toml
 from wavebatch.surveying.systems import figures as tables
 from wavebatch.surveying.systems.survey_result import Decision, Survey
 
@@ -84,17 +84,12 @@ def parse_survey(text: str, name: str) -> SavedSurvey:
     known = ("schema", "version", "strip", "sensor", "waveforms", "system", "figures", "decision", "fingerprint")
     table.check_keys(known, ("schema", "system"), tables.REMEDY)
     table.check_schema(SYSTEM_SCHEMA, "survey again")
-    survey = Survey(
-        system=tables.read_system(table.table("system")),
-        waveforms=table.integer("waveforms", 0, 10**12, 0),
-        figures=tables.read_figures(table.table("figures", {})),
-        decisions=tuple(map(_read_decision, table.tables("decision"))),
-    )
+    system = tables.read_system(table.table("system"))
+    waveforms, figures = table.integer("waveforms", 0, 10**12, 0), tables.read_figures(table.table("figures", {}))
+    kinds, decisions = {"part": str, "needed": bool, "reason": str}, []
+    for row in table.tables("decision"):
+        row.check_keys(kinds, kinds, tables.REMEDY)
+        decisions.append(Decision(**{key: row.get(key, kind) for key, kind in kinds.items()}))
+    survey = Survey(system, waveforms, figures, tuple(decisions))
     texts = (table.get("strip", str, ""), table.get("fingerprint", dict, {}), table.get("version", str, __version__))
     return SavedSurvey(survey, *texts, table.get("sensor", str, ""))
-
-
-def _read_decision(table: TomlTable) -> Decision:
-    kinds = {"part": str, "needed": bool, "reason": str}
-    table.check_keys(kinds, kinds, tables.REMEDY)
-    return Decision(**{key: table.get(key, kind) for key, kind in kinds.items()})
