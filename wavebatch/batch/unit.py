@@ -103,35 +103,6 @@ class Prepared:
         columns = [one for one in self.chosen.columns.values() if isinstance(one, RowColumn)]
         return tuple(one.name for one in columns if one.kind == "computed")
 
-    def choose_rows(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, RunReport]:
-        """Choose the rows that are written.
-
-        Parameters
-        ----------
-        rows : structured array (m,)
-            In the cloud's layout.
-        columns : mapping of str to array (m,)
-            Those `needed` and echo_flags as they were computed, whatever the cloud's names and units.
-
-        Returns
-        -------
-        rows : structured array (k,)
-            Those that are written.
-        report : RunReport
-            Points and flags that are written, and points left out by reason.
-        """
-        left = self.chosen.test(UnitRows(rows, columns), len(rows))
-        kept = left == 0
-        numbers = dict(zip(("", *REASONS), np.bincount(left, minlength=len(REASONS) + 1).tolist(), strict=True))
-        number, total = split_numbers(rows[left == len(REASONS)])
-        report = RunReport(
-            counts={"points_out": numbers[""]},
-            last_left_out=int(np.count_nonzero(number == total)),
-            left_out={name: numbers[name] for name in LEFT_OUT if numbers[name]},
-            flags=count_flags(columns["echo_flags"][kept]),
-        )
-        return rows if kept.all() else rows[kept], report
-
 
 class UnitResult(NamedTuple):
     """What a unit becomes."""
@@ -309,7 +280,17 @@ def finish_rows(
     UnitResult
     """
     start = Seconds.now()
-    rows, left = prepared.choose_rows(rows, columns)
+    codes = prepared.chosen.test(UnitRows(rows, columns), len(rows))
+    kept = codes == 0
+    numbers = dict(zip(("", *REASONS), np.bincount(codes, minlength=len(REASONS) + 1).tolist(), strict=True))
+    number, total = split_numbers(rows[codes == len(REASONS)])
+    left = RunReport(
+        counts={"points_out": numbers[""]},
+        last_left_out=int(np.count_nonzero(number == total)),
+        left_out={name: numbers[name] for name in LEFT_OUT if numbers[name]},
+        flags=count_flags(columns["echo_flags"][kept]),
+    )
+    rows = rows if kept.all() else rows[kept]
     statistics = Statistics(rows.dtype, prepared.layout.extra_records)
     statistics.add(rows)
     timing["assemble"] = timing.get("assemble", Seconds()) + (Seconds.now() - start)

@@ -364,11 +364,19 @@ def _from_file(
     share = known.share_known(start, stop)
     seen = estimate_path(rays, "direction vectors", pairs)
     shown = dict(seen.facts if seen else ())
-    farther, range_error_m, vectors_error = _compare_ranges(distance, rays, seen)
-    late = behind = None
+    farther = vectors_error = late = behind = None
+    range_error_m = 0.0
     if seen is not None and seen.trajectory is not None:
-        # By how much the trajectory comes later than the path by the packet vectors, in s and in m along the flight.
+        # How much longer ranges are than by the packet vectors: median, and mean with scatter, which all rays share.
         by_vectors = seen.trajectory
+        longer = distance - np.sqrt(((rays.point - by_vectors.at(rays.time)) ** 2).sum(axis=1))
+        longer = longer[np.isfinite(longer)]
+        if len(longer):
+            farther, vectors_error = round(float(np.median(longer)), 3), round(seen.error, 6)
+            range_error_m = float(abs(np.mean(longer)) + np.std(longer))
+            if range_error_m > seen.error:  # a contradiction is known no better than the vectors are
+                range_error_m = float(np.hypot(range_error_m, seen.error))
+        # By how much the trajectory comes later than the path by the packet vectors, in s and in m along the flight.
         step = known.at(by_vectors.time + 0.5 * NODE_SECONDS) - known.at(by_vectors.time - 0.5 * NODE_SECONDS)
         square = np.einsum("ni,ni->n", step, step)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -402,23 +410,6 @@ def _from_file(
         vectors_error=vectors_error,
         facts=tuple(facts.items()),
     )
-
-
-def _compare_ranges(
-    distance: np.ndarray, rays: RaySample, path: SensorSource | None
-) -> tuple[float | None, float, float | None]:
-    """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, mean with scatter, and
-    the error of the latter; None, 0 and None where the vectors give no position."""
-    if path is None or path.trajectory is None:
-        return None, 0.0, None
-    longer = distance - np.sqrt(((rays.point - path.trajectory.at(rays.time)) ** 2).sum(axis=1))
-    longer = longer[np.isfinite(longer)]
-    if not len(longer):
-        return None, 0.0, None
-    error = float(abs(np.mean(longer)) + np.std(longer))  # what all rays share holds for each of them
-    # A contradiction is known no better than the vectors are.
-    error = float(np.hypot(error, path.error)) if error > path.error else error
-    return round(float(np.median(longer)), 3), error, round(path.error, 6)
 
 
 def find_turn(

@@ -39,7 +39,7 @@ from wavebatch.surveying.calibrating.adjust_flight import (
     measure_ties,
 )
 from wavebatch.surveying.calibrating.calibration_files import Target
-from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
+from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, open_source
 from wavebatch.surveying.calibrating.targets import (
     MOST_ECHOES,
     build_calibration,
@@ -121,11 +121,43 @@ def read_strip(
         seen = see_channels(source.reader, source.scan)
         known = source.reader.facts.digitizers  # points may name others: they have no waveform
         channels = [ChannelConstant(*channel, 1.0, 0.0) for channel in seen if channel[0] in known]
-        others = [box for i, box in enumerate(boxes) if i != number]
-        area = _TieArea(
-            boxes[number], boxes[0][0], [boxes[number]] if len(channels) > 1 else others, source.scan.packets
-        )
-        on_targets, ties = _collect(source, targets, area)
+        # Ties: squares in the boxes of the strips that it is tied to, so many that about MOST_TIES waveforms count.
+        low, high = boxes[number]
+        tied = boxes[number : number + 1] if len(channels) > 1 else [box for i, box in enumerate(boxes) if i != number]
+        area = float(np.prod(np.maximum(high - low, 1.0)))
+        common = [np.maximum(np.minimum(high, top) - np.maximum(low, bottom), 0.0) for bottom, top in tied]
+        overlap = min(sum(float(np.prod(edge)) for edge in common), area)
+        share = MOST_TIES / max(source.scan.packets * overlap / area, MOST_TIES)
+
+        def ties_at(xyz: np.ndarray) -> np.ndarray:
+            inside = np.zeros(len(xyz), bool)
+            for bottom, top in tied:
+                inside |= ((xyz[:, :2] >= bottom) & (xyz[:, :2] <= top)).all(axis=1)
+            return inside & (hash_squares(xyz) < share)
+
+        if source.column is not None:
+            part = MOST_OF_COLUMN / max(source.scan.packets, 1)
+            near = lambda xyz: hash_squares(xyz) < part  # noqa: E731
+            inside = [near]
+        else:
+            corners = np.concatenate([target.corners for target in targets])
+            first, last = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
+            near = lambda xyz: ((xyz[:, :2] >= first) & (xyz[:, :2] <= last)).all(axis=1)  # noqa: E731
+            inside = [target.contains for target in targets]
+        parts: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in inside]
+        shorts = [np.empty(0, TIE)]
+        for rows in source.echoes(lambda xyz: near(xyz) | ties_at(xyz)):
+            for contains, some in zip(inside, parts, strict=True):
+                if sum(map(len, some)) < MOST_ECHOES:
+                    some.append(rows[contains(rows["xyz"])])
+            rows = rows[ties_at(rows["xyz"]) & np.isfinite(rows["light_err"])]
+            short = np.empty(len(rows), TIE)
+            short["xyz"] = rows["xyz"] - [*boxes[0][0], 0.0]
+            short["source"] = rows["channel"]
+            for name in ("ray", "light", "distance", "time"):
+                short[name] = rows[name]
+            shorts.append(short)
+        on_targets = [np.concatenate(some)[:MOST_ECHOES] for some in parts]
         found, refused = None, ""
         try:
             found = build_calibration(source, targets, on_targets, options)
@@ -148,61 +180,10 @@ def read_strip(
             channels=tuple(describe_channel(row, source) for row in channels),
             ranging=math.hypot(measure_ranging(source.sensor, distance, source.air), source.sent.growth),
             sent=source.sent,
-            ties=ties,
+            ties=np.concatenate(shorts),
             seen=views,
             right=source.setting.right,
         )
-
-
-class _TieArea:
-    """Where a strip is decomposed for ties: squares in the boxes of those that it is tied to."""
-
-    def __init__(self, own: _Box, origin: np.ndarray, tied: Sequence[_Box], packets: int) -> None:
-        self.origin, self._tied = origin, tied
-        area = float(np.prod(np.maximum(own[1] - own[0], 1.0)))
-        common = [np.maximum(np.minimum(own[1], top) - np.maximum(own[0], low), 0.0) for low, top in tied]
-        shared = min(sum(float(np.prod(edge)) for edge in common), area)
-        self._share = MOST_TIES / max(packets * shared / area, MOST_TIES)
-        """Of the squares, so that about MOST_TIES waveforms are decomposed."""
-
-    def contains(self, xyz: np.ndarray) -> np.ndarray:
-        """Return which positions f8 (n, 3) count, bool (n,)."""
-        inside = np.zeros(len(xyz), bool)
-        for low, top in self._tied:
-            inside |= ((xyz[:, :2] >= low) & (xyz[:, :2] <= top)).all(axis=1)
-        return inside & (hash_squares(xyz) < self._share)
-
-
-def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> tuple[list[np.ndarray], np.ndarray]:
-    """Echoes on each target (ECHO), and those for ties (TIE, with channels as sources)."""
-    if source.column is not None:
-        share = MOST_OF_COLUMN / max(source.scan.packets, 1)
-        near = lambda xyz: hash_squares(xyz) < share  # noqa: E731
-        inside = [near]
-    else:
-        corners = np.concatenate([target.corners for target in targets])
-        low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-        near = lambda xyz: ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)  # noqa: E731
-        inside = [target.contains for target in targets]
-    on_targets: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in inside]
-    parts = [np.empty(0, TIE)]
-
-    def wanted(xyz: np.ndarray) -> np.ndarray:
-        return near(xyz) | area.contains(xyz)
-
-    for rows in source.echoes(wanted):
-        for contains, some in zip(inside, on_targets, strict=True):
-            if sum(map(len, some)) < MOST_ECHOES:
-                some.append(rows[contains(rows["xyz"])])
-        # Ties, with channels as sources.
-        tied = rows[area.contains(rows["xyz"]) & np.isfinite(rows["light_err"])]
-        short = np.empty(len(tied), TIE)
-        short["xyz"] = tied["xyz"] - [*area.origin, 0.0]
-        short["source"] = tied["channel"]
-        for name in ("ray", "light", "distance", "time"):
-            short[name] = tied[name]
-        parts.append(short)
-    return [np.concatenate(some)[:MOST_ECHOES] for some in on_targets], np.concatenate(parts)
 
 
 LEAST_SPREAD = 0.01
