@@ -280,17 +280,15 @@ def surveys_agree(surveys: Sequence[Survey]) -> bool:
     if len(surveys) < 2 or any((survey.figures.isolated_echoes or 0) < FEW for survey in surveys):
         return False
     first, *others = surveys
-    return all(_agree(first, other) for other in others)
-
-
-def _agree(a: Survey, b: Survey) -> bool:
-    if (a.figures.spacing_ns, a.figures.bits) != (b.figures.spacing_ns, b.figures.bits):
-        return False
-    noise = min(a.system.noise.std, b.system.noise.std)
-    echoes = min(a.figures.isolated_echoes or 0.0, b.figures.isolated_echoes or 0.0)
-    return (
-        max(a.system.noise.std, b.system.noise.std) < ALIKE_NOISE * noise
-        and abs(a.system.noise.baseline - b.system.noise.baseline) < ALIKE_LEVEL * noise
-        and a.system.digitizers.keys() == b.system.digitizers.keys()
-        and compare_pulses(a.system, b.system) < ALIKE_PULSES + PULSE_ERROR / np.sqrt(echoes)
-    )
+    for other in others:
+        if (first.figures.spacing_ns, first.figures.bits) != (other.figures.spacing_ns, other.figures.bits):
+            return False
+        a, b = first.system, other.system
+        noise = min(a.noise.std, b.noise.std)
+        echoes = min(first.figures.isolated_echoes or 0.0, other.figures.isolated_echoes or 0.0)
+        alike = max(a.noise.std, b.noise.std) < ALIKE_NOISE * noise
+        alike &= abs(a.noise.baseline - b.noise.baseline) < ALIKE_LEVEL * noise
+        alike &= a.digitizers.keys() == b.digitizers.keys()
+        if not (alike and compare_pulses(a, b) < ALIKE_PULSES + PULSE_ERROR / np.sqrt(echoes)):
+            return False
+    return True

@@ -378,26 +378,19 @@ def added_variance(
     elif mode == "paper":
         variance = incidence.spread_variance(incidence.paper_table(system.sigma_ref), width)
     else:
-        width, error, reference = _model_width(block.spacing, system, width, error)
+        shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing, most=BROADEST)
+        if shape.components:
+            # The part of the fitted pulse that a target widens as a Gaussian.
+            one, near, whole = np.ones_like(width), 1e-3 * system.sigma_ref / block.spacing, width / block.spacing
+            low, middle, high = (
+                model_parameters(shape, limits, np.stack([one, one, whole + step], axis=1))[:, 2]
+                for step in (-near, 0.0, near)
+            )
+            width, error = middle * block.spacing, error * (high - low) / (2.0 * near)
+            reference = limits.ref * block.spacing
         variance = width * width - reference * reference - system.widths.variance
     fit_err = 2.0 * np.hypot(width * error, reference * reference * reference_error)
     return variance, np.hypot(fit_err, system.widths.error or 0.0)
-
-
-def _model_width(
-    spacing: float, system: SystemPulse, sigma: np.ndarray, error: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Width of the part of the fitted pulse that a target widens as a Gaussian [ns], its error, the system's width."""
-    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing, most=BROADEST)
-    if not shape.components:
-        return sigma, error, system.sigma_ref
-    one = np.ones_like(sigma)
-    near = 1e-3 * system.sigma_ref / spacing
-    whole = sigma / spacing
-    low, middle, high = (
-        model_parameters(shape, limits, np.stack([one, one, whole + step], axis=1))[:, 2] for step in (-near, 0.0, near)
-    )
-    return middle * spacing, error * (high - low) / (2.0 * near), limits.ref * spacing
 
 
 @stage(
