@@ -179,7 +179,11 @@ def _choose_radius(xyz: np.ndarray) -> float:
         reach = min(2 * reach, RADII[1])
         needed = _find_distance(around, some, number, reach)
     radius = float(np.clip(np.ceil(10.0 * needed) / 10.0, *RADII))
-    while radius < RADII[1] and _share_in_two_lines(around, some, radius) > 0.1:
+    while radius < RADII[1]:
+        # Points whose neighbours lie on two scan lines, seen from above, have no angle.
+        group, offset = around.find(some, radius)
+        if np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))) <= 0.1:
+            break
         radius = min(round(radius + WIDER, 1), RADII[1])
     return radius
 
@@ -195,12 +199,6 @@ def _find_distance(around: Surroundings, some: np.ndarray, number: int, reach: f
     distance = np.full(len(some), 1e9)
     distance[near] = np.sqrt(square[last[near]])
     return float(np.quantile(distance, 0.9))
-
-
-def _share_in_two_lines(around: Surroundings, some: np.ndarray, radius: float) -> float:
-    """Share of the points whose neighbours lie on two scan lines, seen from above: they have no angle."""
-    group, offset = around.find(some, radius)
-    return float(np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))))
 
 
 def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_waveforms: int) -> Iterator[Slopes]:
