@@ -32,6 +32,7 @@ COMPILED = {
     "find_nearest": ("find_nearest", "test_group_returns._nearest_by_loop"),
     "number_returns": ("number_returns", "naive_geometry.number_returns"),
     "share_offsets": ("share_offsets", "test_group_returns._offset_by_loop"),
+    "measure_lobes": ("measure_pulse", "naive_fit.measure"),
     "find_around": ("Surroundings", "test_planes._neighbours_by_loop"),
 }  # fmt: skip
 """Function of the library, the kernel that calls it, and the twin that a test compares that with."""

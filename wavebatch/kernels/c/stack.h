@@ -1,4 +1,4 @@
-/* A sum of Gaussians fitted to a stacked pulse: kernels/fit/learn_pulse.py says what it is for.
+/* A sum of Gaussians: fitted to a stacked pulse, for kernels/fit/learn_pulse.py, and its peak and width by width.
 
    Levenberg and Marquardt's steps, cut off at the bounds, as Python's `fit_bounded`, which the twin in the tests calls. */
 typedef struct {
@@ -101,5 +101,73 @@ EXPORT int64_t fit_stack(const Stacked *s, double *at) {
         }
     }
     free(memory);
+    return 0;
+}
+
+/* The main lobe of pulses is looked for within LOBE widths of the main component, in COARSE steps per width; HALVINGS
+   steps then find its peak and edges, to 1e-7 of such a step. */
+static const double LOBE = 6, COARSE = 8;
+enum { HALVINGS = 40, PLACES = 97 };
+
+INLINE wide pick_wide(wide_bits on, wide yes, wide no) { return (wide)((on & (wide_bits)yes) | (~on & (wide_bits)no)); }
+
+/* Sums of a Gaussian of height 1 and k others, each with its delay, for four widths. */
+INLINE wide draw_lobes(int64_t k, const wide *inverse, const wide *height, const double *terms, wide at) {
+    wide z = at * inverse[0], pulse = exp_wide(z * z * -0.5);
+    for (int64_t i = 0; i < k; i++) {
+        z = (at - terms[3 * i + 1]) * inverse[i + 1];
+        pulse += exp_wide(z * z * -0.5) * height[i + 1];
+    }
+    return pulse;
+}
+
+/* Peak and full width at half maximum of the main lobe, for n widths, a multiple of four, of the main component; k others
+   have weight, delay and variance. */
+EXPORT int64_t measure_lobes(int64_t n, const double *width, int64_t k, const double *terms, double *peak, double *half_width) {
+    wide *inverse = malloc(2 * (k + 1) * sizeof(wide)), *height = inverse + k + 1, coarse[PLACES];
+    if (!inverse) return -1;
+    for (int64_t i = 0; i < n; i += LANES) {
+        const wide main = *(const wide *)(width + i), step = main / COARSE;
+        inverse[0] = 1 / main;
+        for (int64_t j = 0; j < k; j++) {
+            const wide variance = main * main + terms[3 * j + 2];
+            for (int lane = 0; lane < LANES; lane++) inverse[j + 1][lane] = 1 / sqrt(variance[lane]);
+            height[j + 1] = terms[3 * j] * (main * inverse[j + 1]);
+        }
+        wide top = {0}, best = {0}, right = {0}, left = {0};
+        for (int64_t j = 0; j < PLACES; j++) {
+            coarse[j] = draw_lobes(k, inverse, height, terms, main * (j / COARSE - LOBE));
+            const wide_bits higher = j ? coarse[j] > best : ~(wide_bits){0};
+            best = pick_wide(higher, coarse[j], best), top = pick_wide(higher, (wide){0} + (double)j, top);
+        }
+        const wide middle = main * (top / COARSE - LOBE);
+        wide low = middle - step, high = middle + step;
+        for (int j = 0; j < HALVINGS; j++) { /* the thirds of an interval that holds the peak: the lower one goes */
+            const wide third = (high - low) / 3, after = low + third, before = high - third;
+            const wide_bits rises = draw_lobes(k, inverse, height, terms, after) < draw_lobes(k, inverse, height, terms, before);
+            low = pick_wide(rises, after, low), high = pick_wide(rises, high, before);
+        }
+        const wide whole = draw_lobes(k, inverse, height, terms, 0.5 * (low + high)), half = 0.5 * whole;
+        right += (double)(PLACES - 1);
+        for (int64_t j = 0; j < PLACES; j++) {
+            const wide place = (wide){0} + (double)j;
+            const wide_bits below = coarse[j] < half;
+            left = pick_wide(below & (place < top), place, left);
+            right = pick_wide(below & (place > top) & (place < right), place, right);
+        }
+        wide edges[2];
+        for (int side = 0; side < 2; side++) {
+            wide outside = side ? left : right, inside = side ? left + 1 : right - 1;
+            outside = main * (outside / COARSE - LOBE), inside = main * (inside / COARSE - LOBE);
+            for (int j = 0; j < HALVINGS; j++) {
+                const wide at = 0.5 * (inside + outside);
+                const wide_bits is_in = draw_lobes(k, inverse, height, terms, at) >= half;
+                inside = pick_wide(is_in, at, inside), outside = pick_wide(is_in, outside, at);
+            }
+            edges[side] = 0.5 * (inside + outside);
+        }
+        *(wide *)(peak + i) = whole, *(wide *)(half_width + i) = edges[0] - edges[1];
+    }
+    free(inverse);
     return 0;
 }

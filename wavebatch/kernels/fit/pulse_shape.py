@@ -8,12 +8,14 @@ kernels/c/next_echo.h.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.kernels import library
 from wavebatch.kernels.elementary import exp, log, log1p, solve
 from wavebatch.kernels.signal.runs import lobe_edges
 
@@ -247,18 +249,13 @@ class PulseMeasures(NamedTuple):
     """Full width at half maximum of the main lobe [samples], ascending."""
 
 
-LOBE, COARSE, HALVINGS = 6.0, 8, 40
-"""Widths on either side of the main component in which the main lobe is looked for, and steps per width; and steps that
-then find its peak and edges, to 1e-7 of such a step."""
-
-
 def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
-    """Peak and full width at half maximum of a pulse, over a range of widths.
+    """Peak and full width at half maximum of a sum of Gaussians, over a range of widths.
 
     Parameters
     ----------
     shape : PulseShape
-        Model of the pulse.
+        Model of the pulse, without skew or table.
     low, high : float, samples
         Smallest and largest width.
 
@@ -266,54 +263,12 @@ def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
     -------
     PulseMeasures
     """
-    widths = np.linspace(low, high, 200)[:, None]
-    x = widths * np.arange(-LOBE, LOBE + 0.5 / COARSE, 1 / COARSE)
-    step = widths / COARSE
-    row = np.arange(len(x))[:, None]
-    draw, draw_two = _drawer(shape, widths), _drawer(shape, np.concatenate([widths, widths]))
-    coarse = draw(x)
-    top = np.argmax(coarse, axis=1)[:, None]
-    place = np.arange(x.shape[1])
-    low_at, high_at = x[row, top] - step, x[row, top] + step
-    for _ in range(HALVINGS):  # the thirds of an interval that holds the peak: the lower one goes
-        third = (high_at - low_at) / 3
-        left, right = np.split(draw_two(np.concatenate([low_at + third, high_at - third])), 2)
-        low_at = np.where(left < right, low_at + third, low_at)
-        high_at = np.where(left < right, high_at, high_at - third)
-    peak = draw(0.5 * (low_at + high_at))
-    below = coarse < 0.5 * peak
-    right = np.where(below & (place > top), place, x.shape[1] - 1).min(axis=1)[:, None]
-    left = np.where(below & (place < top), place, 0).max(axis=1)[:, None]
-    inside, outside = (np.concatenate([x[row, one] for one in both]) for both in ((right - 1, left + 1), (right, left)))
-    half = 0.5 * np.concatenate([peak, peak])
-    for _ in range(HALVINGS):
-        middle = 0.5 * (inside + outside)
-        is_in = draw_two(middle) >= half
-        inside, outside = np.where(is_in, middle, inside), np.where(is_in, outside, middle)
-    edges = np.split(0.5 * (inside + outside)[:, 0], 2)
-    return PulseMeasures(widths[:, 0], peak[:, 0], _make_rising(edges[0] - edges[1]))
-
-
-def _drawer(shape: PulseShape, widths: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from places around echoes of these widths (k, 1) to unit pulses, to the bits of `evaluate_pulse`.
-
-    Without derivatives, and with what depends on the widths alone computed once: hundreds of calls find edges.
-    """
-    if not shape.components:
-        return lambda place: evaluate_pulse(shape, place, np.zeros_like(widths), widths)[0]
-    parts = [(1 / widths, np.float32(0), np.ones(1))]
-    for weight, delay, extra in shape.components:
-        inverse = 1 / np.sqrt(widths * widths + np.float32(extra))
-        parts.append((inverse, np.float32(delay), np.float32(weight) * (widths * inverse)))
-
-    def draw(place: np.ndarray) -> np.ndarray:
-        pulse = np.zeros(1)
-        for inverse, delay, height in parts:
-            z = (place - delay) * inverse
-            pulse = pulse + exp(z * z * np.float32(-0.5)) * height
-        return pulse
-
-    return draw
+    widths = np.linspace(low, high, 200)
+    terms = np.array(shape.components, np.float32).reshape(-1, 3).astype(np.float64)
+    peak, half_width = np.empty((2, len(widths)))
+    n, k = ctypes.c_int64(len(widths)), ctypes.c_int64(len(terms))
+    library.call("measure_lobes", n, widths, k, terms, peak, half_width)
+    return PulseMeasures(widths, peak, _make_rising(half_width))
 
 
 def _make_rising(half_width: np.ndarray) -> np.ndarray:
