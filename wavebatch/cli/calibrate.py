@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -18,9 +18,6 @@ from wavebatch.files.disk.publish import protecting, refuse_existing, refuse_inp
 from wavebatch.files.text_file import write_text
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.tools.sheets.sheet import list_lines
-
-if TYPE_CHECKING:
-    from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
 
 
 @click.command()
@@ -89,21 +86,7 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
     flight = calibrate_flight(paths, load_targets(targets) if targets else [], how)
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)
-    if report is not None:
-        write_text(report, format_json(_list_report(flight)) + "\n", overwrite=overwrite)
-    answer(_list_report(flight))
-    for note in found.notes:
-        talk(f"warning: {note}")
-    for line in list_lines(calibration_sheet(flight)):
-        tell(line)
-    tell(f"{output}: written")
-    shared.write_html(html_file, found.strip or "strips", calibration_page(flight))
-
-
-def _list_report(flight: FlightCalibration) -> dict[str, Any]:
-    """All figures as plain values."""
-    found = flight.calibration
-    return {
+    figures = {
         "schema": "wavebatch.calibration-report/1",
         **found.describe(),
         "strips": [asdict(row) for row in found.strips],
@@ -112,3 +95,12 @@ def _list_report(flight: FlightCalibration) -> dict[str, Any]:
         "cell_m": flight.cell,
         "warnings": list(found.notes),
     }
+    if report is not None:
+        write_text(report, format_json(figures) + "\n", overwrite=overwrite)
+    answer(figures)
+    for note in found.notes:
+        talk(f"warning: {note}")
+    for line in list_lines(calibration_sheet(flight)):
+        tell(line)
+    tell(f"{output}: written")
+    shared.write_html(html_file, found.strip or "strips", calibration_page(flight))

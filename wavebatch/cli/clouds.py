@@ -87,7 +87,12 @@ def stats(clouds: tuple[Path, ...], output: Path | None, **options: Any) -> None
         rows = [_table_row(cloud, part, *most) for cloud, part in parts]
         write_text(output, format_csv(list(rows[0]), (row.values() for row in rows)), overwrite=options["overwrite"])
     shown = [*each, total] if len(files) > 1 else each
-    document = {"files": [_plain(one) for one in each], "total": _plain(total)}
+    *plain, whole = [
+        {**asdict(one), "returns_per_pulse": one.returns_per_pulse,
+         "areas": [{**asdict(area), "returns_per_pulse": area.returns_per_pulse} for area in one.areas]}
+        for one in (*each, total)
+    ]  # fmt: skip
+    document = {"files": plain, "total": whole}
     sheets = [_sheet(one) for one in shown]
     answer(document, Sheet("stats", [*sheets[0].parts, *sheets[1:]]) if sheets else None)
     sys.exit(EXIT_UNREADABLE if failed else 0)
@@ -151,11 +156,6 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
         zone = zones.get(name, returns.DeadZone(0, math.nan, math.nan))
         found |= {f"dead_zone_m{end}": zone.size, f"dead_zone_err_m{end}": zone.error}
     return found
-
-
-def _plain(found: returns.ReturnStats) -> dict[str, Any]:
-    areas = [{**asdict(area), "returns_per_pulse": area.returns_per_pulse} for area in found.areas]
-    return {**asdict(found), "areas": areas, "returns_per_pulse": found.returns_per_pulse}
 
 
 FEW_CELLS = 1_000_000

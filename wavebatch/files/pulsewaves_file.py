@@ -372,54 +372,54 @@ class PulseReader(Closing):
             if descriptor is None:
                 pulse = first + int(rows[0])
                 raise damaged(self.header.path, f"pulse {pulse} refers to descriptor {number}, which is not there")
-            parts += _Walk(self.header, waves, first).follow(rows, pulses["offset"][rows], descriptor)
+            parts += self._follow(waves, first, rows, pulses["offset"][rows], descriptor)
         if not parts:
             return Segments(*(np.empty(0) for _ in fields(Segments)))
         columns = [np.concatenate([part[column] for part in parts]) for column in range(len(fields(Segments)))]
         order = np.argsort(columns[0] * (1 << 32) + np.concatenate([part[-1] for part in parts]), kind="stable")
         return Segments(*(column[order] for column in columns))
 
+    def _follow(
+        self, waves: Waves, first: int, rows: np.ndarray, offsets: np.ndarray, descriptor: Descriptor
+    ) -> Iterator[tuple]:
+        """Walk through the waves of the pulses `rows` of a descriptor.
 
-class _Walk:
-    """One walk through the waves of the pulses of a descriptor."""
+        Yields the columns of `Segments`, and the order within a pulse, of each sampling and segment.
+        """
+        size = self.header.waves_size
 
-    def __init__(self, header: PulseHeader, waves: Waves, first: int) -> None:
-        self._header, self._waves, self._first = header, waves, first
+        def refuse(wrong: np.ndarray, rows: np.ndarray) -> None:
+            """Raise InputError where something is wrong (k,) with one of the pulses `rows` (k,)."""
+            if wrong.any():
+                pulse = first + int(rows[np.argmax(wrong)])
+                raise damaged(self.header.waves, f"the waves of pulse {pulse} are not inside the file")
 
-    def follow(self, rows: np.ndarray, offsets: np.ndarray, descriptor: Descriptor) -> Iterator[tuple]:
-        """Yields the columns of `Segments`, and the order within a pulse, of each sampling and segment."""
+        def integers(rows: np.ndarray, at: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:
+            refuse(at > size - bits // 8, rows)
+            return waves.take(at, bits // 8).view(f"<{'i' if signed else 'u'}{bits // 8}")[:, 0].astype(np.int64)
+
         at = offsets + descriptor.extra
-        self._refuse(offsets < WAVES_HEADER_SIZE, rows)
+        refuse(offsets < WAVES_HEADER_SIZE, rows)
         number = 0
         for sampling in descriptor.samplings:
             count = np.full(len(rows), sampling.segments)
             if sampling.segment_bits:
-                count = self._integers(rows, at, sampling.segment_bits, signed=False)
+                count = integers(rows, at, sampling.segment_bits, signed=False)
                 at = at + sampling.segment_bits // 8
-            self._refuse(count > MOST_SEGMENTS, rows)
+            refuse(count > MOST_SEGMENTS, rows)
             for segment in range(int(count.max(initial=0))):
                 has = np.flatnonzero(count > segment)
                 those, place, n = rows[has], at[has], len(has)
                 start, length = np.full(n, sampling.offset), np.full(n, sampling.samples)
                 if sampling.duration_bits:
-                    start = start + sampling.scale * self._integers(those, place, sampling.duration_bits, signed=True)
+                    start = start + sampling.scale * integers(those, place, sampling.duration_bits, signed=True)
                     place = place + sampling.duration_bits // 8
                 if sampling.length_bits:
-                    length = self._integers(those, place, sampling.length_bits, signed=False)
+                    length = integers(those, place, sampling.length_bits, signed=False)
                     place = place + sampling.length_bits // 8
                 at[has] = place + length * (sampling.bits // 8)  # the next segment begins behind this one
-                self._refuse((at[has] > self._header.waves_size) | (length > MAX_SAMPLES), those)
+                refuse((at[has] > size) | (length > MAX_SAMPLES), those)
                 same = np.uint8(sampling.kind), np.uint8(sampling.channel), sampling.bits, sampling.spacing
                 columns = (np.full(n, value) for value in (*same, descriptor.unit))
                 yield those, *columns, start, place, length, np.full(n, number)
                 number += 1
-
-    def _integers(self, rows: np.ndarray, at: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:
-        self._refuse(at > self._header.waves_size - bits // 8, rows)
-        return self._waves.take(at, bits // 8).view(f"<{'i' if signed else 'u'}{bits // 8}")[:, 0].astype(np.int64)
-
-    def _refuse(self, wrong: np.ndarray, rows: np.ndarray) -> None:
-        """Raise InputError where something is wrong (k,) with one of the pulses `rows` (k,)."""
-        if wrong.any():
-            pulse = self._first + int(rows[np.argmax(wrong)])
-            raise damaged(self._header.waves, f"the waves of pulse {pulse} are not inside the file")

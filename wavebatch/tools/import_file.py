@@ -123,7 +123,15 @@ def import_file(
     header = pulsewaves_file.read_pulse_header(path)
     source = {"file": path.name, **take_fingerprint(path, header.waves)}
     account = {"import": source, "options": options.describe(), "version": __version__}
-    state = _find_state(target, account)
+    # Of this import, of another import or none, or another file.
+    state = "mine"
+    if target.exists():
+        try:
+            records = [vlr for vlr in read_header(target).vlrs if vlr.user_id.rstrip(b"\0") == USER_ID]
+            found = json.loads(records[0].payload) if records else None
+            state = "same" if found == account else "other" if found is None else "mine"
+        except (InputError, ValueError):
+            state = "other"
     if options.resume and state == "same":
         return ImportSummary(str(path), str(target), header.count, skipped=True)
     # A killed import may have left the packets of a strip that never appeared.
@@ -191,20 +199,6 @@ def import_file(
         notes.append("its recordings of outgoing pulses show no pulse")
     counts.notes = (*frame.notes, *notes)
     return counts
-
-
-def _find_state(target: Path, account: dict[str, Any]) -> str:
-    """`same`: the strip of this import is there; `mine`: that of another import, or none; `other`: another file."""
-    if not target.exists():
-        return "mine"
-    try:
-        records = [vlr for vlr in read_header(target).vlrs if vlr.user_id.rstrip(b"\0") == USER_ID]
-        found = json.loads(records[0].payload) if records else None
-    except (InputError, ValueError):
-        return "other"
-    if found is None:
-        return "other"
-    return "same" if found == account else "mine"
 
 
 # The first pass: what segments and outgoing pulses there are

@@ -172,7 +172,19 @@ LEAST_SHARED = 0.05
 
 def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS) -> CloudTask:
     """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
-    by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
+    by_time = pulses_told_apart(first) and pulses_told_apart(second)
+    if by_time:
+        # Formats round times differently: those of one flight in two formats are equal by chance only. So enough pulses
+        # of the first piece of the shorter cloud must be in the other cloud.
+        short, long = sorted((first, second), key=lambda reader: reader.point_count)
+        times = np.unique(next(short.read_pieces(), np.empty(0, CLOUD_DTYPE))["gps_time"])
+        found = np.zeros(len(times), bool)
+        for piece in long.read_pieces():
+            found |= np.isin(times, piece["gps_time"])
+            if found.mean() > LEAST_SHARED:
+                break
+        else:
+            by_time = not len(times)
     for reader in (first, second):
         reader.measure_in_metres()
     points = max(first.point_count, second.point_count)
@@ -182,22 +194,6 @@ def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, held
         some = np.concatenate([rows["xyz"][::100, 0] for rows in first.read_pieces()])
         task.borders = np.quantile(some, np.arange(1, task.number) / task.number)
     return task
-
-
-def _share_times(first: CloudReader, second: CloudReader) -> bool:
-    """Whether enough pulses of the first piece of the shorter cloud are in the other cloud.
-
-    Formats round times differently: those of one flight in two formats are equal by chance only.
-    """
-    short, long = sorted((first, second), key=lambda reader: reader.point_count)
-    rows = next(short.read_pieces(), np.empty(0, CLOUD_DTYPE))
-    times = np.unique(rows["gps_time"])
-    found = np.zeros(len(times), bool)
-    for piece in long.read_pieces():
-        found |= np.isin(times, piece["gps_time"])
-        if found.mean() > LEAST_SHARED:
-            return True
-    return not len(rows)
 
 
 class CloudTask(Closing):

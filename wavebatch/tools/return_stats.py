@@ -282,24 +282,22 @@ class AreaTally:
             sums, area = self._sums[row], self.division.describe(int(self._areas[row]))
             several, parts = int(sums["several"]), (sums["pairs"], sums["apart"], sums["least"])
             ranks = zip(self._ranks, *parts, strict=True)
+            shares = {}
+            for name in ("by_number", "by_count"):  # of the sum, without zeros
+                total = int(sums[name].sum())
+                shares[name] = {int(n): int(sums[name][n]) / total for n in np.flatnonzero(sums[name])}
             found.append(AreaStats(
                 **area._asdict(),
                 **asdict(describe_pairs(parts[0].sum(), parts[1].sum(), parts[2].min())),
                 points=int(sums["by_number"].sum()),
                 pulses=int(sums["by_count"].sum()),
-                by_number=_share_counts(sums["by_number"]),
-                by_count=_share_counts(sums["by_count"]),
+                by_number=shares["by_number"],
+                by_count=shares["by_count"],
                 separations={name: describe_pairs(*values) for name, *values in ranks if values[0]},
                 several=several,
                 depth=float(sums["depth"]) / several if several else math.nan,
             ))  # fmt: skip
         return found
-
-
-def _share_counts(counts: np.ndarray) -> dict[int, float]:
-    """Shares of the sum, without zeros."""
-    total = int(counts.sum())
-    return {int(n): int(counts[n]) / total for n in np.flatnonzero(counts)}
 
 
 BIN, BINS = 0.01, 10_000

@@ -23,7 +23,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.strip.scanner import expand
 from wavebatch.kernels.geometry.group_returns import find_pulses
-from wavebatch.kernels.geometry.slice_lines import HoughLine, find_lines, find_sweeps
+from wavebatch.kernels.geometry.slice_lines import find_lines, find_sweeps
 
 LEAST_PULSES = 8
 """Shorter lines are left out: they hold no surface to find."""
@@ -346,36 +346,35 @@ def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
     # A flat surface is no straight line over time, so bends mean ridges in a plane only.
     pulse = piece.line.row[rows] if piece.geometry == "plane" else None
     lines = find_lines(x, y, weight, sigma=sigma, gap=gap, shortest=options.shortest, most=options.most, pulse=pulse)
-    return [_describe(piece, found, rows[found.rows], number) for number, found in enumerate(lines)]
-
-
-def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> Segment:
-    line = piece.line
-    start, end = piece.locate(found.start), piece.locate(found.end)
-    apart = np.subtract(end, start)
-    pulses = np.unique(line.row[rows])
-    # Spread of the centroids of pulses about the line, so that the width of a pulse does not count.
-    theta = np.radians(found.theta)
-    off = piece.x[rows] * np.cos(theta) + piece.y[rows] * np.sin(theta) - found.rho
-    if piece.geometry == "time":
-        off = off / max(np.cos(theta), 1e-9)
-    weight = line.value[rows].astype(np.float64)
-    sums, moments = np.bincount(line.row[rows], weight), np.bincount(line.row[rows], weight * off)
-    centroid = moments[sums > 0] / sums[sums > 0]
-    return Segment(
-        line=line.number,
-        segment=number,
-        start=start,
-        end=end,
-        ends=(piece.scale(found.start), piece.scale(found.end)),
-        length=float(np.linalg.norm(apart)),
-        slope=float(np.degrees(np.arctan2(apart[2], np.hypot(apart[0], apart[1])))),
-        residual=float(np.sqrt(np.mean(centroid**2)) * piece.pixel),
-        pulses=len(pulses),
-        first_pulse=int(pulses[0]),
-        last_pulse=int(pulses[-1]),
-        first_point=int(line.point[pulses[0]]),
-        theta=found.theta,
-        rho=found.rho,
-        weight=found.weight,
-    )
+    line, segments = piece.line, []
+    for number, found in enumerate(lines):
+        on_line = rows[found.rows]
+        start, end = piece.locate(found.start), piece.locate(found.end)
+        apart = np.subtract(end, start)
+        pulses = np.unique(line.row[on_line])
+        # Spread of the centroids of pulses about the line, so that the width of a pulse does not count.
+        theta = np.radians(found.theta)
+        off = piece.x[on_line] * np.cos(theta) + piece.y[on_line] * np.sin(theta) - found.rho
+        if piece.geometry == "time":
+            off = off / max(np.cos(theta), 1e-9)
+        weight = line.value[on_line].astype(np.float64)
+        sums, moments = np.bincount(line.row[on_line], weight), np.bincount(line.row[on_line], weight * off)
+        centroid = moments[sums > 0] / sums[sums > 0]
+        segments.append(Segment(
+            line=line.number,
+            segment=number,
+            start=start,
+            end=end,
+            ends=(piece.scale(found.start), piece.scale(found.end)),
+            length=float(np.linalg.norm(apart)),
+            slope=float(np.degrees(np.arctan2(apart[2], np.hypot(apart[0], apart[1])))),
+            residual=float(np.sqrt(np.mean(centroid**2)) * piece.pixel),
+            pulses=len(pulses),
+            first_pulse=int(pulses[0]),
+            last_pulse=int(pulses[-1]),
+            first_point=int(line.point[pulses[0]]),
+            theta=found.theta,
+            rho=found.rho,
+            weight=found.weight,
+        ))  # fmt: skip
+    return segments

@@ -400,7 +400,25 @@ class KeyedSums(Closing):
         borders = np.unique(marks[:: max(self._held // self._stride, 1)]).tolist()
         for low, high in zip(borders, [*borders[1:], 1 << 64], strict=True):
             touched = [run for run in self._runs if int(run.marks[0]) < high and run.last >= low]
-            yield _sum([self._read_range(run, low, high) for run in touched])
+            parts = []
+            for run in touched:
+                # Between two keys that mark places, then without the rows whose keys are not in [low, high).
+                begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * self._stride
+                end = run.number
+                if high <= run.last:
+                    end = min(int(np.searchsorted(run.marks, np.uint64(high))) * self._stride, end)
+                if self._file is None:
+                    raise ValueError("the sums are closed")
+                with reporting_scratch():
+                    self._file.seek((run.first + begin) * self._dtype.itemsize)
+                    data = self._file.read((end - begin) * self._dtype.itemsize)
+                if len(data) != (end - begin) * self._dtype.itemsize:
+                    raise InputError(f"{scratch_place()}: a temporary file was cut by another program; run again")
+                rows = np.frombuffer(data, self._dtype)
+                last = len(rows) if high > run.last else int(np.searchsorted(rows["key"], np.uint64(high)))
+                rows = rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
+                parts.append((rows["key"], rows["value"]))
+            yield _sum(parts)
 
     def _shrink(self) -> None:
         """Sums up the rows in memory."""
@@ -420,25 +438,6 @@ class KeyedSums(Closing):
                 self._file.write(rows.data)
                 self._runs.append(_Run(first, len(key), key[::self._stride].copy(), int(key[-1])))
         self._parts, self._number = [], 0
-
-    def _read_range(self, run: _Run, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
-        """Keys and values of the rows of a run with keys in [low, high)."""
-        begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * self._stride
-        end = run.number
-        if high <= run.last:
-            end = min(int(np.searchsorted(run.marks, np.uint64(high))) * self._stride, end)
-        size = self._dtype.itemsize
-        if self._file is None:
-            raise ValueError("the sums are closed")
-        with reporting_scratch():
-            self._file.seek((run.first + begin) * size)
-            data = self._file.read((end - begin) * size)
-        if len(data) != (end - begin) * size:
-            raise InputError(f"{scratch_place()}: a temporary file was cut by another program; run again")
-        rows = np.frombuffer(data, self._dtype)
-        last = len(rows) if high > run.last else int(np.searchsorted(rows["key"], np.uint64(high)))
-        rows = rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
-        return rows["key"], rows["value"]
 
 
 class _Run(NamedTuple):

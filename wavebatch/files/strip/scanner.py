@@ -507,7 +507,11 @@ class Scanner:
         begin, end = first * step, min(last * step, count)
         rest = self._source.read(max(begin - self._sizes.window, 0), begin)
         for at in range(begin, end, step):
-            part = self._read(at, min(at + step, count))
+            stop = min(at + step, count)
+            part, self._head = self._head[at:stop], self._head if stop < len(self._head) else self._head[:0]
+            if len(part) < stop - at:
+                more = self._source.read(at + len(part), stop)
+                part = np.concatenate([part, more]) if len(part) else more
             cut = _find_cut(rest, part) if at else 0
             if at == begin:
                 # The window begins with the last points before the first unit.
@@ -525,13 +529,6 @@ class Scanner:
             cut = _find_cut(rest, after) if len(after) else 0
             yield borders[-1], join_records(rest, after[:cut]) if cut else rest
             borders.append(end + cut)
-
-    def _read(self, start: int, stop: int) -> np.ndarray:
-        """Points [start, stop); the first ones are there."""
-        here, self._head = self._head[start:stop], self._head if stop < len(self._head) else self._head[:0]
-        if not len(here):
-            return self._source.read(start, stop)
-        return here if len(here) == stop - start else np.concatenate([here, self._source.read(start + len(here), stop)])
 
     def _try_keeping(self, write: Callable[[], object]) -> None:
         """Do without the kept points where there is no room for them."""

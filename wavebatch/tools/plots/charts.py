@@ -236,46 +236,36 @@ def picture_cloud(path: Path, columns: Sequence[str]) -> Iterator[Sheet]:
     seen = sample.read()
     if not seen or not len(seen["place"]):
         return
-    pairs = zip(facts, seen["values"].T, strict=True)
-    if drawn := [part for one, values in pairs for part in draw_column(one, values)]:
+    drawn: list[Picture] = []
+    for one, values in zip(facts, seen["values"].T, strict=True):
+        values = values[np.isfinite(values)]
+        if len(values):  # without far outliers
+            low, high = robust_limits(values, float(values.min()), float(values.max()))
+            room = 0.5 * (high == low) * max(abs(high), 1.0)
+            counts, edges = np.histogram(values, BINS, (low - room, high + room))
+            beyond = len(values) - int(counts.sum())
+            drawn += draw_histogram(edges, counts, title=one.name, label=f"{one.name} [{one.unit}]", beyond=beyond)
+    if drawn:
         yield Sheet("Columns of the cloud", drawn)
-    note = f"; every {sample.step}th point" if sample.step > 1 else ""
-    if drawn := [part for one in map_columns(path, facts, sample) for part in draw_map(one, note)]:
-        yield Sheet("Maps", drawn)
-
-
-def draw_column(facts: ColumnFacts, values: np.ndarray) -> list[Picture]:
-    """The histogram of a column without far outliers; empty without values."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return []
-    low, high = robust_limits(values, float(values.min()), float(values.max()))
-    room = 0.5 * (high == low) * max(abs(high), 1.0)
-    counts, edges = np.histogram(values, BINS, (low - room, high + room))
-    beyond = len(values) - int(counts.sum())
-    return draw_histogram(edges, counts, title=facts.name, label=f"{facts.name} [{facts.unit}]", beyond=beyond)
-
-
-def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) -> list[Raster]:
-    """The density of the points, and the mean of each column that has values."""
-    seen = sample.read()
+    # The density of the points, and the mean of each column that has values.
     places = seen["place"]
     box = (*places.min(axis=0).tolist(), *places.max(axis=0).tolist())
     grid = choose_grid(str(path), sample, box, None, fixed=False, most=MOST_CELLS)
     crs = describe_crs(path)
     row, column, inside = grid.place(*places.T)
     cell = (row * grid.columns + column)[inside]
-    every = np.full(len(places), float(sample.step))
-    points = ColumnFacts("points", "-", "", 0.0)
-    wanted = [("density", points, every)]
+    wanted = [("density", ColumnFacts("points", "-", "", 0.0), np.full(len(places), float(sample.step)))]
     wanted += [("mean", one, values) for one, values in zip(facts, seen["values"].T, strict=True)]
-    maps, size = [], grid.rows * grid.columns
+    note, maps = f"; every {sample.step}th point" if sample.step > 1 else "", []
     for statistic, one, values in wanted:
-        found = compute_cells(statistic, cell, values[inside], size, grid.size**2 / sample.step)
+        size, area = grid.rows * grid.columns, grid.size**2 / sample.step
+        found = compute_cells(statistic, cell, values[inside], size, area)
         if np.isfinite(found).any():
             found = found.reshape(grid.rows, grid.columns)
-            maps.append(Raster(one, (path.name,), Tally(), statistic, grid, found, 0, find_shown(found), crs))
-    return maps
+            shown = find_shown(found)
+            maps += draw_map(Raster(one, (path.name,), Tally(), statistic, grid, found, 0, shown, crs), note)
+    if maps:
+        yield Sheet("Maps", maps)
 
 
 def _keep(

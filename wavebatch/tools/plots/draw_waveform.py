@@ -17,7 +17,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.figure_file import fit_parts, fit_text, open_picture, plain_text, set_head
 from wavebatch.kernels.signal.runs import find_stretches
-from wavebatch.tools.plots.waveform import DetectorSignal, WaveformView, list_echoes
+from wavebatch.tools.plots.waveform import WaveformView, list_echoes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -135,8 +135,35 @@ def _draw_panels(
     axes.errorbar(view.echoes.time[shown].astype(np.float64), find_echo_heights(view)[shown], yerr=amplitude, xerr=time,
                   fmt="D", markersize=4, markerfacecolor="none", color=ECHO, capsize=2, zorder=4, label="echoes")
     fit_signal_panel(axes, view, times)
-    if view.seen is not None:
-        draw_detector(panels[1], view.seen, times, small=small)
+    seen = view.seen
+    if seen is not None:  # what the detector saw, its threshold, and where it found echoes
+        axes = panels[1]
+        axes.tick_params(labelbottom=False)
+        axes.plot(seen.time, seen.values, color=INK, linewidth=1.0)
+        tested = seen.values if seen.second is None else seen.second
+        if seen.second is not None:
+            axes.plot(seen.time, seen.second, color=PULSE, linewidth=0.9)
+        found = seen.found.time.astype(np.float64)
+        height = np.interp(found, seen.time, tested)
+        if seen.deep:
+            axes.vlines(found, height, height + seen.least, color=CLIPPED, linewidth=2.0, label="detector's threshold")
+            # Strong echoes are so much deeper than the threshold that a bar alone would not be seen.
+            axes.plot(found, height + seen.least, "_", color=CLIPPED, markersize=11, markeredgewidth=2.0, zorder=4)
+        elif np.isfinite(seen.least):
+            axes.axhline(float(seen.least), color=CLIPPED, linewidth=1.0, linestyle=_DASHED,
+                         label="detector's threshold")  # fmt: skip
+        axes.plot(found, height, "^" if seen.deep else "v", color=ECHO, markersize=5, markerfacecolor="none", zorder=4,
+                  label="found by the detector")  # fmt: skip
+        rule = seen.rule + (f"; blue: {seen.second_label}" if seen.second_label else "")
+        wrapped = textwrap.fill(rule, 52 if small else 110)
+        inside = (seen.time >= times[0]) & (seen.time <= times[1])
+        lines = [line[inside] for line in (seen.values, tested)] + [np.atleast_1d(0.0 if seen.deep else seen.least)]
+        low, high = np.nanmin(np.concatenate(lines)), np.nanmax(np.concatenate(lines))
+        span = float(high - low) or 1.0
+        # Room above for the rule, which must not lie on the line.
+        first, more = (0.4, 0.36) if small else (0.3, 0.22)
+        axes.set_ylim(low - 0.08 * span, high + (first + more * wrapped.count("\n")) * span)
+        axes.text(0.995, 0.97, wrapped, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=GREY)
     _draw_residual(panels[-1], view, times)
     size = 9 if small else 10.5
     parts = [f"packet {view.packet}"] if view.packet >= 0 else []
@@ -204,35 +231,6 @@ def _number_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
             axes.annotate(str(row), (time, height), textcoords="offset points", xytext=(0, 5), ha="center",
                           annotation_clip=False, color=ECHO, fontsize=size, weight="bold").set_in_layout(False)
             last = time
-
-
-def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], *, small: bool) -> None:
-    """Draws what a detector saw, its threshold, and where it found echoes."""
-    axes.tick_params(labelbottom=False)
-    axes.plot(seen.time, seen.values, color=INK, linewidth=1.0)
-    tested = seen.values if seen.second is None else seen.second
-    if seen.second is not None:
-        axes.plot(seen.time, seen.second, color=PULSE, linewidth=0.9)
-    found = seen.found.time.astype(np.float64)
-    height = np.interp(found, seen.time, tested)
-    if seen.deep:
-        axes.vlines(found, height, height + seen.least, color=CLIPPED, linewidth=2.0, label="detector's threshold")
-        # Strong echoes are so much deeper than the threshold that a bar alone would not be seen.
-        axes.plot(found, height + seen.least, "_", color=CLIPPED, markersize=11, markeredgewidth=2.0, zorder=4)
-    elif np.isfinite(seen.least):
-        axes.axhline(float(seen.least), color=CLIPPED, linewidth=1.0, linestyle=_DASHED, label="detector's threshold")
-    axes.plot(found, height, "^" if seen.deep else "v", color=ECHO, markersize=5, markerfacecolor="none", zorder=4,
-              label="found by the detector")  # fmt: skip
-    rule = seen.rule + (f"; blue: {seen.second_label}" if seen.second_label else "")
-    wrapped = textwrap.fill(rule, 52 if small else 110)
-    inside = (seen.time >= times[0]) & (seen.time <= times[1])
-    lines = [line[inside] for line in (seen.values, tested)] + [np.atleast_1d(0.0 if seen.deep else seen.least)]
-    low, high = np.nanmin(np.concatenate(lines)), np.nanmax(np.concatenate(lines))
-    span = float(high - low) or 1.0
-    # Room above for the rule, which must not lie on the line.
-    first, more = (0.4, 0.36) if small else (0.3, 0.22)
-    axes.set_ylim(low - 0.08 * span, high + (first + more * wrapped.count("\n")) * span)
-    axes.text(0.995, 0.97, wrapped, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=GREY)
 
 
 def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float], height: float | None = None) -> None:

@@ -239,7 +239,15 @@ def measure_profile(
             continue
         step = _PIECE // len(edges) + 1
         for part in (slice(start, start + step) for start in range(0, len(rows), step)):
-            share = share_heights(rows["values"][part, 1:], edges)
+            # Share of the height of each segment in each bin. Bins hold their lower edge; a level segment lies in one.
+            ends = rows["values"][part, 1:]
+            low, high = ends.min(axis=1), ends.max(axis=1)
+            span = high - low
+            level = span < 1e-9 * max(float(np.abs(edges).max()), 1.0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                below = np.clip((edges - low[:, None]) / span[:, None], 0.0, 1.0)
+            below[level] = low[level, None] < edges
+            share = np.diff(below, axis=1)
             numbers[row] += share.sum(axis=0)
             sums[row] += value[part] @ share
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -251,20 +259,6 @@ def measure_profile(
         kind, unit, more = "files", UNIT, {"noun": "segments"}
     names = names if each or len(paths) == 1 else (f"{len(paths)} {kind}",)
     return Profile(clouds.facts, names, total, statistic, edges, values, outside, unit, **more)
-
-
-def share_heights(ends: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Share of the height of each segment in each bin, f8 (n, b).
-
-    ends: heights of both ends, f8 (n, 2). Bins hold their lower edge; a level segment lies in one bin.
-    """
-    low, high = ends.min(axis=1), ends.max(axis=1)
-    span = high - low
-    level = span < 1e-9 * max(float(np.abs(edges).max()), 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        below = np.clip((edges - low[:, None]) / span[:, None], 0.0, 1.0)
-    below[level] = low[level, None] < edges
-    return np.diff(below, axis=1)
 
 
 def place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:

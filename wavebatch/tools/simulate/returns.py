@@ -367,7 +367,12 @@ def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, k
     inside = (truth.time >= 0) & (truth.time <= recording.duration)
     inside &= truth.amplitude >= WEAKEST * recording.recorded_noise
     echoes = truth.take(np.flatnonzero(inside))
-    echoes = echoes.take(_pick_strongest(echoes))
+    if len(echoes):  # the strongest of every run of echoes that a discrete receiver cannot separate
+        width = FWHM_PER_SIGMA * echoes.sigma
+        apart = np.diff(echoes.time) >= DISTINCT * 0.5 * (width[1:] + width[:-1])
+        starts = np.concatenate([[True], apart | (np.diff(echoes.waveform) != 0)])
+        order = np.lexsort((-echoes.amplitude, np.cumsum(starts) - 1))
+        echoes = echoes.take(order[np.flatnonzero(starts)])
     echoes = echoes.take(np.flatnonzero(_count_within(echoes.waveform) < most))
     pulse, time, amplitude = echoes.waveform.astype(np.int64), echoes.time, echoes.amplitude
     if keep_empty:
@@ -396,18 +401,6 @@ def fill_packets(
     points["return_point_wave_location"] = np.where(has, time * PS_PER_NS, 0)
     for axis, name in enumerate(("x_t", "y_t", "z_t")):
         points[name] = np.where(has, -step[:, axis] / PS_PER_NS, 0)
-
-
-def _pick_strongest(echoes: EchoTable) -> np.ndarray:
-    """Row of the strongest echo of every run of echoes that a discrete receiver cannot separate."""
-    if not len(echoes):
-        return np.empty(0, np.int64)
-    width = FWHM_PER_SIGMA * echoes.sigma
-    apart = np.diff(echoes.time) >= DISTINCT * 0.5 * (width[1:] + width[:-1])
-    starts = np.concatenate([[True], apart | (np.diff(echoes.waveform) != 0)])
-    run = np.cumsum(starts) - 1
-    order = np.lexsort((-echoes.amplitude, run))
-    return order[np.flatnonzero(starts)]
 
 
 def _count_within(group: np.ndarray) -> np.ndarray:
@@ -478,26 +471,6 @@ class SynthesisSummary:
         return {**asdict(self), "light_used": self.light_used}
 
 
-@frozen(eq=False)
-class _Pulses:
-    """n whole pulses with k returns, and the echoes that model them."""
-
-    pulse: np.ndarray
-    """Pulse of each return, i8 (k,)."""
-    time: np.ndarray
-    """Time of each return after sample 0 [ns], f8 (k,)."""
-    amplitude: np.ndarray
-    """[DN], f8 (k,)."""
-    sigma: np.ndarray
-    """Standard deviation of each echo [ns], f8 (k,)."""
-    ray: np.ndarray
-    """Unit vector of each pulse away from the sensor, f8 (n, 3)."""
-    kind: np.ndarray
-    """Index in _LENGTHS of the waveform of each pulse, i8 (n,); len(_LENGTHS) where none is long enough."""
-    is_scattered: np.ndarray
-    """Pulses whose points state another number of returns, bool (n,)."""
-
-
 def synthesize_strip(
     cloud: Path,
     target: Path,
@@ -542,29 +515,40 @@ def synthesize_strip(
         ) as writer:  # fmt: skip
             for number, (rows, records) in enumerate(_read_pulses(reader, piece)):
                 rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(number,)))
-                pulses = _model_pulses(rows, records, gain, light, rng)
-                offset, energy = _write_packets(writer, recordings, pulses, rng)
+                # Echoes of the returns, with sample 0 a margin and a random part of a sample before the first of each
+                # pulse.
+                starts = group_pulses(rows["gps_time"], rows["number"])
+                count = np.diff(np.append(starts, len(rows)))
+                pulse = np.repeat(np.arange(len(starts)), count)
+                ray = fit_rays(rows["xyz"], starts, rows["scan_angle"], rows["source"])
+                strength, sigma = light.measure(rows, records, starts)
+                delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
+                margin = MARGIN * np.maximum.reduceat(sigma, starts)
+                phase = options.spacing * rng.random(len(starts))
+                time = delay + (margin + phase - np.minimum.reduceat(delay, starts))[pulse]
+                n_samples = np.ceil((np.maximum.reduceat(time, starts) + margin) / options.spacing) + 1
+                # Index in _LENGTHS of the waveform of each pulse; len(_LENGTHS) where none is long enough.
+                kind, amplitude = np.searchsorted(_LENGTHS, n_samples), gain * strength
+                offset, energy = _write_packets(writer, recordings, kind, (pulse, time, amplitude, sigma), rng)
                 summary.energy_recorded += energy
-                summary.energy_of_level += rise * float(np.append(_LENGTHS, 0)[pulses.kind].sum())
+                summary.energy_of_level += rise * float(np.append(_LENGTHS, 0)[kind].sum())
                 # Fields of the input, and where their packets are.
                 points = np.zeros(len(records), writer.dtype)
                 for name in set(field_names(writer.dtype)) & set(field_names(records.dtype)) - set(_PACKET_FIELDS):
                     points[name] = records[name]
-                kind = pulses.kind[pulses.pulse]
-                index = np.where(kind < len(_LENGTHS), kind + 1, 0)
-                size = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
-                ray = pulses.ray[pulses.pulse] * HALF_C
-                fill_packets(points, index, offset[pulses.pulse], size, pulses.time, ray)
+                index = np.where(kind < len(_LENGTHS), kind + 1, 0)[pulse]
+                size = np.append(_LENGTHS, 0)[kind[pulse]] * (options.bits // 8)
+                fill_packets(points, index, offset[pulse], size, time, ray[pulse] * HALF_C)
                 writer.write_points(points)
-                too_long, modelled = pulses.kind == len(_LENGTHS), SQRT_2PI * pulses.amplitude * pulses.sigma
+                too_long, modelled = kind == len(_LENGTHS), SQRT_2PI * amplitude * sigma
                 summary.energy += float(modelled.sum())
-                summary.energy_without_packet += float(modelled[too_long[pulses.pulse]].sum())
+                summary.energy_without_packet += float(modelled[too_long[pulse]].sum())
                 summary.points += len(points)
                 summary.packets += int(np.count_nonzero(~too_long))
-                summary.without_packet += int(np.count_nonzero(too_long[pulses.pulse]))
+                summary.without_packet += int(np.count_nonzero(too_long[pulse]))
                 most = recordings[0].clip - recordings[0].baseline
-                summary.saturated += int(np.count_nonzero(pulses.amplitude > most))
-                summary.scattered += int(np.count_nonzero(pulses.is_scattered))
+                summary.saturated += int(np.count_nonzero(amplitude > most))
+                summary.scattered += int(np.count_nonzero(rows["total"][starts] != count))
                 if progress:
                     progress(len(rows))
             light.check_widths()
@@ -603,47 +587,27 @@ def _choose_gain(reader: CloudReader, light: LightModel) -> float:
     return float(room / _LEVELS[min(level, len(_LEVELS) - 1)])
 
 
-def _model_pulses(
-    rows: np.ndarray, records: np.ndarray, gain: float, light: LightModel, rng: np.random.Generator
-) -> _Pulses:
-    """Echoes of the returns, with sample 0 a margin and a random part of a sample before the first of each pulse."""
-    spacing, starts = light.options.spacing, group_pulses(rows["gps_time"], rows["number"])
-    count = np.diff(np.append(starts, len(rows)))
-    pulse = np.repeat(np.arange(len(starts)), count)
-    ray = fit_rays(rows["xyz"], starts, rows["scan_angle"], rows["source"])
-    strength, sigma = light.measure(rows, records, starts)
-    delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
-    margin = MARGIN * np.maximum.reduceat(sigma, starts)
-    phase = spacing * rng.random(len(starts))
-    time = delay + (margin + phase - np.minimum.reduceat(delay, starts))[pulse]
-    n_samples = np.ceil((np.maximum.reduceat(time, starts) + margin) / spacing) + 1
-    return _Pulses(
-        pulse=pulse,
-        time=time,
-        amplitude=gain * strength,
-        sigma=sigma,
-        ray=ray,
-        kind=np.searchsorted(_LENGTHS, n_samples),
-        is_scattered=rows["total"][starts] != count,
-    )
-
-
 def _write_packets(
-    writer: FullwaveWriter, recordings: list[Recording], pulses: _Pulses, rng: np.random.Generator
-) -> tuple[np.ndarray, float]:
-    """Byte offset of every pulse's packet, u8 (n,), 0 where it has none; and the energy of the samples [DN ns]."""
+    writer: FullwaveWriter, recordings: list[Recording], kind: np.ndarray, echoes: tuple[np.ndarray, ...],
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """Byte offset of every pulse's packet, u8 (n,), 0 where it has none; and the energy of the samples [DN ns].
+
+    kind: which of the recordings each pulse (n,) has, if any. echoes: pulse, time after sample 0 [ns], amplitude [DN]
+    and standard deviation [ns] of each echo (k,).
+    """
     energy = 0.0
-    offset = np.zeros(len(pulses.kind), np.uint64)
+    offset = np.zeros(len(kind), np.uint64)
     for number, recording in enumerate(recordings):
-        same = np.flatnonzero(pulses.kind == number)
+        same = np.flatnonzero(kind == number)
         step = max(_PAINTED // recording.n_samples, 1)
         for begin in range(0, len(same), step):
             chosen = same[begin : begin + step]
             place = np.full(len(offset), -1)
             place[chosen] = np.arange(len(chosen))
-            waveform = place[pulses.pulse]
-            echoes = waveform >= 0
-            columns = (values[echoes] for values in (waveform, pulses.time, pulses.amplitude, pulses.sigma))
+            waveform = place[echoes[0]]
+            inside = waveform >= 0
+            columns = (values[inside] for values in (waveform, *echoes[1:]))
             signal = paint_echoes(recording, len(chosen), *columns)
             counts = record_counts(recording, signal, rng)
             energy += recording.spacing * (float(counts.sum(dtype=np.float64)) - recording.baseline * counts.size)

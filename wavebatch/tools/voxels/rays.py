@@ -388,7 +388,13 @@ def read_batches(
         near = [one for one in (number, number + 1) if one < reader.unit_count()]
         units = {one: units.get(one) or reader.read_unit(one, scan) for one in near}
         lost = {one: found for one, found in lost.items() if one >= number - 1}
-        lost |= {one: _list_lost(unit, reader) for one, unit in units.items() if one not in lost}
+        for one, unit in units.items():
+            if one not in lost:  # the returns of the unit whose packet is missing or broken
+                points = unit.points[unit.packet_of_point < 0]
+                channel = read_scanner(points)
+                lost[one] = np.zeros(len(points), LOST)
+                lost[one]["time"], lost[one]["place"] = points["gps_time"], locate(points, reader.facts.header)
+                lost[one]["scanner"] = 0 if channel is None else channel
         rows = [np.flatnonzero(unit.packets.owned) for unit in units.values()]
         rows[0] = rows[0][~np.isin(units[number].packets.owner[rows[0]], taken)]
         tables = list(zip(units.values(), rows, strict=True))
@@ -423,15 +429,6 @@ def read_batches(
                 parts.append((unit, mine[some[inside] - shift], groups[inside], kept[some[inside]]))
             if len(some):
                 yield Batch(parts, known[np.isin(known["group"], groups)])
-
-
-def _list_lost(unit: Unit, reader: StripReader) -> np.ndarray:
-    """The returns of a unit whose packet is missing or broken, LOST (k,)."""
-    points = unit.points[unit.packet_of_point < 0]
-    lost, scanner = np.zeros(len(points), LOST), read_scanner(points)
-    lost["time"], lost["place"] = points["gps_time"], locate(points, reader.facts.header)
-    lost["scanner"] = 0 if scanner is None else scanner
-    return lost
 
 
 def _choose_packets(unit: Unit, keep: PlannedFilter) -> np.ndarray:
