@@ -16,7 +16,7 @@ from wavebatch.core.errors import StageError
 from wavebatch.files.las.header import split_numbers
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
-from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate import StripOptions, simulate_strip
 
 
 def _spoil(points):
@@ -69,26 +69,41 @@ def _read_packets(path):
     return np.concatenate(points), echoes, members, flags, prepared
 
 
-def _find_pulse(times):
-    start = 0
-    pulse = []
-    for i, time in enumerate(times):
-        if i == 0 or time != times[i - 1]:
-            start = i
-        pulse.append(start)
-    for i, first in enumerate(pulse):
-        if times[i] == 0 or pulse.count(first) >= LONGEST_PULSE:
-            pulse[i] = i
+def _find_pulse(points, leads, place):
+    """The pulse of each point that owns a packet or has none: of equal time, and on one line."""
+    times = points["gps_time"].tolist()
+    rays = -np.stack([points[axis].astype(float) for axis in ("x_t", "y_t", "z_t")], axis=1)
+    pulse = list(range(len(times)))
+    for time in set(times) - {0.0}:
+        if times.count(time) >= LONGEST_PULSE:
+            continue
+        group = [i for i in leads if times[i] == time]
+        owners, heads = [i for i in group if leads[i]], []
+        for i in group:
+            pulse[i] = group[0]
+            ray = rays[i if leads[i] else owners[0]] if owners else None
+            for head, line in heads:
+                off = np.subtract(place(i), place(head))
+                off -= line * (off @ line) / (line @ line)
+                if np.linalg.norm(off) < 0.1 and np.linalg.norm(ray - line) < 1e-4 * np.linalg.norm(line):
+                    pulse[i] = head
+                    break
+            else:
+                if owners:
+                    pulse[i] = i
+                    heads.append((i, ray))
     return pulse
 
 
 def _expect_rows(points, echoes, members, flags, scales, offsets):
     """The rows of echoes mode, one dictionary each."""
     rows = []
-    pulse = _find_pulse(points["gps_time"].tolist())
 
     def place(i):
         return [points[axis][i] * s + o for axis, s, o in zip("XYZ", scales, offsets, strict=True)]
+
+    leads = {i: i in echoes for i in range(len(points)) if flags[i] or i in echoes}
+    pulse = _find_pulse(points, leads, place)
 
     for i in range(len(points)):
         if flags[i]:
@@ -286,6 +301,8 @@ def test_counts_do_not_depend_on_the_units(edit_points, tmp_path, points):
 
 def test_return_numbers_beyond_the_point_format_are_cut_and_flagged(tiny_strip, edit_points, tmp_path):
     def join(points):
+        for name in (*"XYZ", "x_t", "y_t", "z_t"):  # on one line
+            points[name][:20] = points[name][0]
         points["gps_time"][:20] = 77.25
         points["gps_time"][20:] = np.arange(len(points) - 20) + 100.0
         return points
@@ -302,6 +319,36 @@ def test_return_numbers_beyond_the_point_format_are_cut_and_flagged(tiny_strip, 
     found, _ = read_cloud(tmp_path / "six" / "joined.las")
     cut = np.count_nonzero(found["echo_flags"] & EchoFlag.RETURN_LIMIT)
     assert cut == np.count_nonzero(found["gps_time"] == 77.25) - 15
+
+
+@pytest.mark.parametrize("how", ["scanner", "rounded", "sorted"])
+def test_packets_of_equal_time_are_one_pulse_where_they_lie_on_one_line(edit_points, tmp_path, how):
+    """Lasers that fire together, and pulses of a rounded time, became one pulse; packets far apart several."""
+
+    def change(rows):
+        pulse = np.unique(rows["gps_time"], return_inverse=True)[1]
+        if how == "sorted":  # a packet for each return of a pulse, one sample after that of the return before
+            later = split_numbers(rows)[0] - 1
+            rows["wavepacket_offset"] += later
+            rows["return_point_wave_location"] -= 1000.0 * later
+            return rows[np.argsort(later, kind="stable")]
+        each = {"scanner": 2, "rounded": 10}[how]
+        rows["gps_time"] = 300_000_000.0 + pulse // each
+        if how == "scanner":
+            rows["classification_flags"] = pulse % each << 4
+        return rows
+
+    simulate_strip("forest", tmp_path / "a.las", pulses=600, seed=2, options=StripOptions(point_format=9))
+    assert run_one(tmp_path / "a.las", tmp_path / "right", format="las").error is None
+    strip = edit_points(tmp_path / "a.las", tmp_path / "b.las", change)
+    assert run_one(strip, tmp_path / "out", format="las").error is None
+    (right, _), (found, _) = (read_cloud(tmp_path / name) for name in ("right/a.las", "out/b.las"))
+    (number, total), (first, most) = split_numbers(found), split_numbers(right)
+    if how == "sorted":
+        assert np.bincount(number)[1] == np.bincount(first)[1] and number.max() > 1.5 * first.max()
+    else:
+        np.testing.assert_array_equal(np.bincount(number), np.bincount(first))
+        np.testing.assert_array_equal(np.bincount(total), np.bincount(most))
 
 
 def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):

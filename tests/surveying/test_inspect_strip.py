@@ -120,6 +120,20 @@ def test_check_reports_directions_and_obeys_the_option(tmp_path):
     assert not any("is not clear" in line for line in check_file(path, direction="away").problems)
 
 
+def test_descriptors_of_unlike_gains_are_named(tmp_path):
+    """Half the amplitudes of a strip were twice as large as the others of the same ground in silence."""
+    raw = make_raw()
+    raw.points["wavepacket_index"][::2] += 1
+    for gain, named in ((1.0, False), (-1.0, False), (2.0, True)):
+        raw.vlrs = [descriptor(1), descriptor(2, gain=gain)]
+        path = raw.write(tmp_path / f"{gain}.las")
+        assert ("note: descriptors have gains of 1, 2 V per count" in run("check", path).stdout) == named
+        done = run("run", path, "-o", tmp_path / "out", "--profile", "fast", "--overwrite")
+        assert done.exit_code == 0 and ("amplitudes and energies are in counts of each" in done.stderr) == named
+        done = run("voxelize", path, "--size", 1, "-o", tmp_path / "v.npz", "--overwrite")
+        assert done.exit_code == 0 and ("amplitudes and energies are in counts of each" in done.stderr) == named
+
+
 def test_check_notes_do_no_harm_unless_strict(tmp_path):
     raw = make_raw()
     raw.vlrs = [descriptor(1, gain=0.0)]

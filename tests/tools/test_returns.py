@@ -22,7 +22,7 @@ from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.tools import return_stats as returns
 from wavebatch.tools.return_stats import AreaGrid, PolygonSet, count_returns
-from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
+from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, simulate_returns, simulate_strip
 
 
 def write_cloud(path, time, z, number, total, *, flags=None, point_format=1):
@@ -126,6 +126,21 @@ def test_flags_are_counted_and_points_without_echo_are_no_pair(tmp_path):
     found = count_returns([write_cloud(tmp_path / "c.las", **SMALL, flags=flags)])[1]
     assert {name: n for name, n in found.flags.items() if n} == {"NO_ECHO": 1, "WEAK": 1, "OVERLAPPED": 2}
     assert found.separations["all"].pairs == 1
+
+
+@pytest.mark.parametrize(("scanners", "pulses"), [(1, 40), (2, 80)])
+def test_points_beyond_the_number_of_returns_are_named_unless_scanners_tell_them_apart(tmp_path, scanners, pulses):
+    """Points that are stored twice, and lasers that fire together, made pulses of twice as many returns in silence."""
+    simulate_strip("forest", tmp_path / "a.las", pulses=40, seed=1, options=StripOptions(point_format=9))
+    las = laspy.read(tmp_path / "a.las")
+    twice = laspy.LasData(las.header)
+    twice.points = las.points[np.repeat(np.arange(len(las.points)), 2)]
+    twice.scanner_channel = np.arange(len(twice.points)) % scanners
+    twice.write(tmp_path / "b.las")
+    found = count_returns([tmp_path / "b.las"])[1]
+    said = [line for line in found.warnings if line.startswith(("crowded", "incomplete"))]
+    assert (found.points, found.pulses, len(said)) == (2 * len(las.points), pulses, scanners == 1)
+    assert all(line.startswith("crowded: 40 of 40 pulses have more points") for line in said)
 
 
 def test_total_is_the_sum_of_the_files(tmp_path):

@@ -7,6 +7,7 @@ from packet_strips import LENGTHS, draw_canopy, record, render, write_recorded
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.files.cloud.point_filter import PointFilter
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.voxels.rays import LOST, PACKET, SAMPLE, join_packets, read_batches
@@ -159,6 +160,36 @@ def test_light_is_known_up_to_a_lost_packet(canopy, strips, tmp_path):
     whole = voxelize(strips[1], tmp_path)[1]
     expected = whole["energy"][layer_of(whole) == 100].sum()
     assert found["energy"][z == 100].sum() == pytest.approx(expected, rel=0.001)
+
+
+def test_returns_that_are_missing_or_stand_far_apart_are_named(strips, canopy, edit_points, tmp_path):
+    """Sorted by return number, packets of a pulse were pulses of their own; of first returns alone light is missing."""
+    *pulses, _ = canopy
+    with StripReader(strips[1]) as reader:
+        time = reader.read_points(0, reader.facts.header.point_count)["gps_time"]
+    totals = np.unique(time, return_counts=True)[1]
+
+    def number(points):
+        _, first, pulse = np.unique(points["gps_time"], return_index=True, return_inverse=True)
+        points["bit_fields"] = np.arange(len(points)) - first[pulse] + 1 | totals[pulse] << 3
+        return points
+
+    def sort(points):
+        return points[np.argsort(points["bit_fields"] & 7, kind="stable")]
+
+    whole = edit_points(strips[1], tmp_path / "whole.las", number)
+    by_number = edit_points(whole, tmp_path / "sorted.las", sort)
+    first = write_recorded(
+        tmp_path / "f.las", *pulses, record(canopy[0], 4), order=lambda n, pulse: np.unique(pulse, return_index=True)[1]
+    )
+    thinned = edit_points(first, tmp_path / "thinned.las", number)
+    for strip, unit_points, words in (
+        (whole, None, ""), (whole, 600, ""), (by_number, None, ""), (by_number, 600, "stand far apart in the file"),
+        (thinned, None, f"{len(time) - N} of {len(time)} returns that"),
+    ):  # fmt: skip
+        summary, _ = voxelize(strip, tmp_path, unit_points=unit_points)
+        said = [line for line in summary.warnings if "in the file" in line]
+        assert len(said) == bool(words) and all(words in line for line in said), (strip, unit_points)
 
 
 @pytest.mark.parametrize("apart", ["direction", "scanner", "place"])

@@ -22,11 +22,12 @@ from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_whole_records, widen_integers
-from wavebatch.files.las.header import locate, split_numbers
-from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
+from wavebatch.files.las.header import locate, read_scanner, split_numbers
+from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, find_rays, group_times, number_returns
 
 if TYPE_CHECKING:
     from wavebatch.files.cloud.writer import OutputLayout
+    from wavebatch.files.las.header import LasHeader
     from wavebatch.files.strip.reader import Unit
 
 _REFLECTING = ("level_reflectance", "facing_reflectance")
@@ -211,7 +212,7 @@ def assemble_echoes(
     # For all rows at once: to take those that are passed through takes longer than to locate the others too.
     places = np.where(absent, locate(records, layout.source.header), xyz) if absent.any() else xyz
     flags = np.append(table.flags, np.uint16(0))[echo] | reason
-    pulse = find_pulses(unit.points["gps_time"])[owner]
+    pulse = _find_pulses(unit, echoes, layout.source.header)[owner]
     # Pulses without any waveform, and rows that are not written, keep the numbers of the input.
     number, total = (given.astype(np.int64) for given in split_numbers(records))
     kept = (flags & np.uint16(dropped)) == 0
@@ -286,6 +287,35 @@ def assemble_returns(
 def _bug(unit: Unit, what: str) -> StageError:
     last = unit.start + len(unit.points) - 1
     return StageError(f"points {unit.start} to {last}: {what}; please report it as a bug")
+
+
+def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarray:
+    """First point of the pulse of each point of the unit that owns a packet or has none, i8 (n,).
+
+    Points of equal time and scanner on one line are a pulse, wherever they stand in the unit: lasers may fire at the
+    same time, times may be rounded, and points may be sorted.
+    """
+    time = unit.points["gps_time"]
+    pulse = find_pulses(time)
+    heads = time[pulse == np.arange(len(time))]
+    if np.any(heads[1:] <= heads[:-1]):
+        pulse = group_times(time)
+    packet = np.full(len(time), -1)
+    rows = np.flatnonzero(unit.packets.owned)
+    packet[unit.packets.owner[rows] - unit.start] = rows
+    lead = np.flatnonzero((packet >= 0) | (unit.point_flags > 0))
+    number = np.bincount(pulse[lead], minlength=len(time))
+    # Of each group the packet whose ray points without one may be on; they need none in groups without any.
+    known = np.full(len(time), -1)
+    owners = lead[packet[lead] >= 0][::-1]
+    known[pulse[owners]] = packet[owners]
+    lead = lead[(number[pulse[lead]] > 1) & (known[pulse[lead]] >= 0)]
+    points = take_whole_records(unit.points, lead)
+    scanner = read_scanner(points)
+    scanner = np.zeros(len(lead), np.uint8) if scanner is None else scanner
+    step = echoes.direction[np.where(packet[lead] >= 0, packet[lead], known[pulse[lead]])]
+    pulse[lead] = lead[find_rays(pulse[lead], scanner, locate(points, header), step)]
+    return pulse
 
 
 def _columns(

@@ -32,7 +32,7 @@ from wavebatch.stages.chain_file import effective
 from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
-from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets
+from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets, name_gains
 from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.system_file import format_survey
 from wavebatch.surveying.systems.known_systems import doubt_survey
@@ -295,7 +295,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         hardly measure; a trajectory that contradicts the vectors, or
         that does not cover the strip; changes of energy that nothing shows.
     """
-    lines = [*prepared.scan.notes]
+    lines = [*prepared.scan.notes, *name_gains(prepared.facts, prepared.scan)]
     lines += filter(None, [prepared.sensor.doubt()])
     lines += prepared.job.calibration.notes if prepared.job.calibration else ()
     lines += _find_gaps(prepared.sensor, report.no_data)

@@ -105,7 +105,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     ]
     if not scan.with_waveform + scan.broken:
         notes.append("no point has a waveform; every point would be passed through")
-    notes += [*scan.notes, *audit_header(reader, scan)]
+    notes += [*name_gains(facts, scan), *scan.notes, *audit_header(reader, scan)]
     summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in ((scan.points, "point"), (scan.packets, "packet")))
     if scan.packets:
         summary += f", vectors {scan.vectors.direction} the sensor"
@@ -157,6 +157,17 @@ def describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
 def _without_name(path: Path, error: Exception) -> str:
     """The error's line without the file's name in front, which the caller shows."""
     return " ".join(str(error).split()).removeprefix(f"{path}: ")
+
+
+def name_gains(facts: StripFacts, scan: StripScan) -> Iterator[str]:
+    """Say that counts of several descriptors do not compare, where these have other gains."""
+    used = [digitizer for index, digitizer in facts.digitizers.items() if index in scan.by_descriptor]
+    gains = sorted({abs(digitizer.gain) for digitizer in used} - {0.0})
+    if len(gains) > 1:
+        yield (
+            f"descriptors have gains of {', '.join(f'{gain:g}' for gain in gains)} V per count: amplitudes and "
+            "energies are in counts of each, and do not compare; `calibrate` gives each channel its constant"
+        )
 
 
 def doubt_files(facts: StripFacts, scan: StripScan) -> Iterator[StripWarning]:

@@ -388,7 +388,8 @@ def count_returns(
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 
-    A pulse is the points of equal GPS time in a cloud; if times do not separate pulses, a run of rising return numbers.
+    A pulse is the points of equal GPS time and scanner in a cloud; if times do not separate pulses, a run of rising
+    return numbers.
     chosen: count only these points. divisions: count also by areas; a pulse belongs, with all its returns, to the
     area of its first return. skip: called with the InputError of a cloud that cannot be read, which is then left out;
     without it, the error is raised.
@@ -467,7 +468,8 @@ class _Keys:
         """Pulse number of each row, u8 (n,)."""
         if not self._by_time:
             return self._count_up(rows["number"])
-        keys = time_keys(rows["gps_time"])
+        # Two bits that no exponent of a GPS time uses.
+        keys = time_keys(rows["gps_time"]) ^ (rows["scanner"].astype(np.uint64) << np.uint64(60))
         # Hundreds of points without a time are no pulse of hundreds of returns.
         missing = np.flatnonzero(np.isnan(rows["gps_time"]) | (rows["gps_time"] == 0))
         keys[missing] = _NOT_A_TIME + self._count_up(rows["number"][missing])
@@ -490,6 +492,8 @@ class _Tally:
 
     left_out: int = 0
     incomplete: int = 0
+    crowded: int = 0
+    """Those of `incomplete` with more points than stored in them."""
     depth: float = 0.0
     methods: set[str] = field(default_factory=set)
     distances: np.ndarray = field(default_factory=lambda: np.zeros((len(RANKS), BINS), np.int64))
@@ -510,7 +514,9 @@ class _Tally:
         rows = rows[np.lexsort((rows["number"], rows["key"]))]
         first = np.flatnonzero(np.concatenate([[True], rows["key"][1:] != rows["key"][:-1]]))
         counts = np.diff(np.append(first, len(rows)))
-        self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
+        total = rows["total"][first]
+        self.incomplete += int(np.count_nonzero(counts != total))
+        self.crowded += int(np.count_nonzero((counts > total) & (total > 0)))
         # Pulses with several returns, and the height of their first above their last return [m].
         last = np.append(first[1:], len(rows)) - 1
         with np.errstate(invalid="ignore", over="ignore"):
@@ -534,6 +540,7 @@ class _Tally:
         self.methods |= other.methods
         self.left_out += other.left_out
         self.incomplete += other.incomplete
+        self.crowded += other.crowded
         self.depth += other.depth
         self.distances += other.distances
         for area, more in zip((self.whole, *self.areas), (other.whole, *other.areas), strict=True):
@@ -574,9 +581,16 @@ class _Tally:
                 f"limit: {whole.by_count[most]:.1%} of the pulses have {most} returns, more than have "
                 f"{most - 1}; the sensor records at most {most}, and later surfaces are missing"
             )
-        if self.incomplete > 0.001 * whole.pulses:
+        if self.crowded > 0.001 * whole.pulses:
             lines.append(
-                f"incomplete: {self.incomplete} of {whole.pulses} pulses have another number of points than stored in "
+                f"crowded: {self.crowded} of {whole.pulses} pulses have more points than their number of returns: "
+                "points are stored twice, or pulses share a time (it is rounded, or lasers fire together); returns per "
+                "pulse and distances are wrong"
+            )
+        incomplete = self.incomplete - self.crowded
+        if incomplete > 0.001 * whole.pulses:
+            lines.append(
+                f"incomplete: {incomplete} of {whole.pulses} pulses have another number of points than stored in "
                 "them; tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
             )
         return ReturnStats(

@@ -56,6 +56,7 @@ RETURN_DTYPE = np.dtype(
         ("echo_width", "<f4"),
         ("flags", "<u2"),
         ("source", "<u2"),
+        ("scanner", "u1"),
     ]  # fmt: skip
 )
 """One return of a cloud. Keep it small: statistics hold many of them in memory."""
@@ -280,6 +281,7 @@ class CloudReader(Closing):
             "intensity": lambda: raw["intensity"],
             "scan_angle": lambda: las.read_angles(raw),
             "source": lambda: raw["point_source_id"],
+            "scanner": lambda: las.read_scanner(raw) if self.point_format > 5 else 0,
         }
         rows = np.zeros(len(raw), self.dtype)
         for name in las.field_names(self.dtype):

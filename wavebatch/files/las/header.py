@@ -402,6 +402,13 @@ def read_angles(points: np.ndarray) -> np.ndarray:
     return points["scan_angle"] * ANGLE_UNIT if modern else points["scan_angle_rank"].astype(np.float64)
 
 
+def read_scanner(records: np.ndarray) -> np.ndarray | None:
+    """Scanner channels of records (n,), u1 (n,); None for point formats 0 to 5."""
+    if "classification_flags" not in field_names(records.dtype):
+        return None
+    return (records["classification_flags"] >> 4) & 3
+
+
 def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool) -> int:
     """Return the point format of the output: that of the input without waveforms, or the `wanted` one.
 

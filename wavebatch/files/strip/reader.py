@@ -22,7 +22,7 @@ from wavebatch.core.order import distinct, even_places, find_order, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
-from wavebatch.files.las.header import field_names, locate
+from wavebatch.files.las.header import locate, read_scanner
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check, scanner
 from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
@@ -405,13 +405,6 @@ class _Geometry:
             scanner=read_scanner(lead),
             missing=missing,
         )
-
-
-def read_scanner(records: np.ndarray) -> np.ndarray | None:
-    """Scanner channels of records (n,), u1 (n,); None for point formats 4 and 5."""
-    if "classification_flags" not in field_names(records.dtype):
-        return None
-    return (records["classification_flags"] >> 4) & 3
 
 
 MOST_SLICES = 4096

@@ -34,8 +34,8 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
-from wavebatch.files.las.header import locate
-from wavebatch.files.strip.reader import StripReader, StripScan, Unit, read_scanner
+from wavebatch.files.las.header import locate, read_scanner
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.files.strip.scanner import expand
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, along_ray, find_rays, group_times, on_ray
 from wavebatch.kernels.geometry.planes import fit_planes

@@ -6,7 +6,7 @@ output must not depend on batches, so nothing here may mix pulses of a batch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import MISSING, asdict, dataclass, field, replace
 from itertools import pairwise
@@ -26,13 +26,14 @@ from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
 from wavebatch.files.disk.temp_store import HELD
-from wavebatch.files.las.header import locate
+from wavebatch.files.las.header import locate, split_numbers
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request, widest_chain
+from wavebatch.surveying.inspect_strip import name_gains
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey
@@ -53,6 +54,10 @@ _SAMPLED = 2048
 """Waveforms from which the middle and the extent of the strip are found."""
 _MOST_FITTING = 0.9
 """Share of the sampled rays that must fit the grid; fewer mean damaged coordinates or too small voxels."""
+
+MOST_MISSING = 0.05
+"""Share of the returns that may be missing from a file, or of the pulses that may be found in parts: the border of a
+tile cuts fewer, thinning and sorting more."""
 
 
 @frozen
@@ -203,9 +208,12 @@ def voxelize_strip(
                     "or give a --system file that has it"
                 )
         middle = _find_middle(reader, scan, options)
-        floor, ceiling = rays.Floor(middle), rays.Ceiling(middle, options.size)
+        floor, ceiling, shown = rays.Floor(middle), rays.Ceiling(middle, options.size), np.zeros(256, np.int64)
         for begin, end in pairwise(scan.borders.tolist()):
-            xyz = locate(reader.read_points(begin, end), reader.facts.header)
+            points = reader.read_points(begin, end)
+            number, total = split_numbers(points)
+            shown += np.bincount(16 * np.minimum(total, 15).astype(np.int64) + np.minimum(number, 15), minlength=256)
+            xyz = locate(points, reader.facts.header)
             floor.add(xyz)
             ceiling.add(xyz)
         tracer = _Tracer(
@@ -263,7 +271,34 @@ def voxelize_strip(
             summary.profile_samples = 0 if writer is None else writer.samples
             summary.shape, summary.origin = tuple(grid.shape.tolist()), tuple((grid.low * grid.size).tolist())
             summary.outside, summary.energy, summary.unknown = grid.outside, grid.energy, grid.unknown
+            if calibration is None:
+                summary.warnings += (*name_gains(reader.facts, scan),)
+            # Where returns share packets, and no pulse has several, those that are left hold all light.
+            split = summary.several_packets > 0 or scan.with_waveform == scan.packets
+            summary.warnings += (*_doubt_returns(shown.reshape(16, 16), summary.pulses, split),)
             return summary
+
+
+def _doubt_returns(shown: np.ndarray, found: int, split: bool) -> Iterator[str]:
+    """Say that returns are missing from the file, or stand too far apart to be found as a pulse.
+
+    shown: points by number of returns and return number, i8 (16, 16); found: pulses; split: they may have several
+    packets.
+    """
+    kinds = [shown[n, 1 : n + 1] for n in range(1, 16)]
+    there, pulses = int(shown.sum()), sum(int(kind.max()) for kind in kinds)
+    missing = sum(int(len(kind) * kind.max() - kind.sum()) for kind in kinds)
+    if split and missing > MOST_MISSING * (there + missing):
+        yield (
+            f"{missing} of {there + missing} returns that the points' numbers of returns count are not in the file: "
+            "where returns of a pulse have packets of their own, the light of these is missing, and shares are wrong; "
+            "take the whole strip"
+        )
+    if found > (1.0 + MOST_MISSING) * pulses > 0:
+        yield (
+            f"{found} pulses are found where the points' return numbers count {pulses}: packets of a pulse stand far "
+            "apart in the file, and count as pulses of their own, so that shares are wrong; sort the strip by GPS time"
+        )
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
