@@ -70,6 +70,20 @@ def test_parts_give_the_scan_of_one_process(strip):
     assert check(strip)["with_waveform"]
 
 
+def test_what_is_kept_until_the_end_does_not_grow_with_the_units(strip, monkeypatch):
+    """512 packets and 256 votes of each unit took 80 MB of a strip of 10^8 waveforms; fewer decide the same."""
+    decided, kept = [], []
+    for many in (256, 2):
+        monkeypatch.setattr(scanner, "MANY_UNITS", many)
+        with open_strip(strip) as reader, reader.scan_units(0, reader.unit_count()) as part:
+            kept.append((sum(len(keys) for keys, *_ in part.sample), sum(map(len, part.votes.ratios))))
+        with open_strip(strip) as reader, reader.scan(tolerant=True) as found:
+            decided.append((found.vectors.direction, found.forms))
+    assert decided[0] == decided[1]
+    assert kept[0][0] > 1.8 * kept[1][0] and kept[0][1] > 1.8 * kept[1][1]
+    assert 500 < kept[1][0] <= 2 * 512 and 100 < kept[1][1] <= 4 * 256
+
+
 @pytest.mark.parametrize("distance", [30, 150, 10**6])
 def test_parts_of_shuffled_points_too(tmp_path, edit_points, distance):
     """Returns of a packet lie in several units: within the window, and anywhere in the strip."""

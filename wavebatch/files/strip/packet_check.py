@@ -549,9 +549,9 @@ SomePackets = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Packets of a unit: the key of each (see `Judged.keys`), its samples and whether they are packed."""
 
 
-def take_some(judged: Judged, rows: np.ndarray) -> SomePackets:
+def take_some(judged: Judged, rows: np.ndarray, most: int = SAMPLED_PER_UNIT) -> SomePackets:
     """Return some of the packets of a unit; rows: points with different packets, ordered by byte offset."""
-    rows = rows[even_places(len(rows), SAMPLED_PER_UNIT)]
+    rows = rows[even_places(len(rows), most)]
     return judged.keys[rows], judged.n_samples[rows], judged.packed[rows]
 
 

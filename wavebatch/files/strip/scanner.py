@@ -312,6 +312,9 @@ MOST_OVERLAP = 4
 of packets that begin a byte apart would be 1e9 samples. Returns far apart in the file claim their packet once each."""
 _PAIRS, _VOTERS = 4096, 256
 """Most pairs and points of a unit that vote on the direction of vectors."""
+MANY_UNITS = 256
+"""Units from which on each gives fewer votes and packets: they are kept until all are scanned, and took 80 MB of a strip
+of 10^8 waveforms."""
 _FAR_SAMPLES = 32
 """Units of a shuffled strip that vote again with their context."""
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
@@ -399,6 +402,7 @@ class Scanner:
         has_packet = (self._head["wavepacket_index"] > 0) & (self._head["wavepacket_size"] > 0)
         self._form = check.find_form(self._head[has_packet])
         self._units = -(-facts.header.point_count // unit_points)
+        self._thinning = max(-(-self._units // MANY_UNITS), 1)
         self._found = ScanPart(facts, self._form, self._units, sizes)
         self._keeps = facts.header.compressed
         self._widths = np.zeros(256, np.int64)
@@ -552,11 +556,12 @@ class Scanner:
         groups = self._found.near.add(near.keys, near.index, near.unit, own, lambda rows: self._entries(near, rows))
         first = groups.order[groups.starts] - (len(near.keys) - len(rows))
         new = rows[first[first >= 0]]
-        self._found.sample.append(check.take_some(judged, new))
+        self._found.sample.append(check.take_some(judged, new, max(check.SAMPLED_PER_UNIT // self._thinning, 1)))
         width = np.take(self._widths, points["wavepacket_index"][new])
         self._found.claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
-            self._found.votes.add_points(take_whole_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
+            step = max(1, self._thinning * len(rows) // _VOTERS)
+            self._found.votes.add_points(take_whole_records(points, rows[::step]))
             self._vote(groups, near, own)
         self._window = near
 
