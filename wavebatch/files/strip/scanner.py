@@ -313,8 +313,8 @@ of packets that begin a byte apart would be 1e9 samples. Returns far apart in th
 _PAIRS, _VOTERS = 4096, 256
 """Most pairs and points of a unit that vote on the direction of vectors."""
 MANY_UNITS = 256
-"""Units from which on each gives fewer votes and packets: they are kept until all are scanned, and took 80 MB of a strip
-of 10^8 waveforms."""
+"""Units from which on each gives fewer votes and packets: they are kept until all are scanned, and took 80 MB of a
+strip of 10^8 waveforms."""
 _FAR_SAMPLES = 32
 """Units of a shuffled strip that vote again with their context."""
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
