@@ -442,8 +442,8 @@ class Scanner:
             if suspects.any():
                 # Some units vote again with their context: in a shuffled strip only there the returns of a packet meet.
                 for unit in range(0, self._units, max(1, self._units // _FAR_SAMPLES)):
-                    start, stop = self._found.borders[unit], self._found.borders[unit + 1]
-                    context = unique_entries(self._found.context.read(unit))
+                    start, stop = found.borders[unit], found.borders[unit + 1]
+                    context = unique_entries(found.context.read(unit))
                     records = np.concatenate([self._source.read(start, stop), context["record"]])
                     index = np.concatenate([np.arange(start, stop), context["index"]])
                     judged = self._judge.judge(records, self._form)

@@ -224,7 +224,21 @@ def measure_profile(
     if not sample.seen:
         raise clouds.complain(total)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
-    edges = place_heights(sample.read()["place"].ravel(), *box.ravel().tolist(), size, voxel)
+    # Edges of bins: multiples of their size; for voxels the faces of these, or no voxel would lie on one side only.
+    heights = sample.read()["place"].ravel()
+    low, high = cells.robust_limits(heights, *box.ravel().tolist())
+    if size is None:
+        size = cells.round_up(max(high - low, 1e-3) / _CHOSEN_BINS)
+    if not (math.isfinite(size) and size > 0):
+        raise ConfigError(f"--size {size:g}: must be above 0")
+    base = 0.0
+    if voxel:
+        size = voxel * max(round(size / voxel), 1)
+        base = float(heights.min()) - 0.5 * voxel
+    first, last = math.floor((low - base) / size + 1e-6), math.floor((high - base) / size + 1e-6)
+    if last - first >= MOST_BINS:
+        raise ConfigError(f"--size {size:g}: gives more than {MOST_BINS} bins; give a larger one")
+    edges = base + np.arange(first, last + 2) * size
     series = len(paths) if each else 1
     sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
     for cloud, rows, _ in clouds.read():
@@ -259,23 +273,6 @@ def measure_profile(
         kind, unit, more = "files", UNIT, {"noun": "segments"}
     names = names if each or len(paths) == 1 else (f"{len(paths)} {kind}",)
     return Profile(clouds.facts, names, total, statistic, edges, values, outside, unit, **more)
-
-
-def place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:
-    """Edges of bins: multiples of their size; for voxels the faces of these, or no voxel would lie on one side only."""
-    low, high = cells.robust_limits(sample, least, largest)
-    if size is None:
-        size = cells.round_up(max(high - low, 1e-3) / _CHOSEN_BINS)
-    if not (math.isfinite(size) and size > 0):
-        raise ConfigError(f"--size {size:g}: must be above 0")
-    base = 0.0
-    if voxel:
-        size = voxel * max(round(size / voxel), 1)
-        base = float(sample.min()) - 0.5 * voxel
-    first, last = math.floor((low - base) / size + 1e-6), math.floor((high - base) / size + 1e-6)
-    if last - first >= MOST_BINS:
-        raise ConfigError(f"--size {size:g}: gives more than {MOST_BINS} bins; give a larger one")
-    return base + np.arange(first, last + 2) * size
 
 
 LIGHT, FAINT = ("energy", "cross_section"), 0.02

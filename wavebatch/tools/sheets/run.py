@@ -262,7 +262,23 @@ def _list_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> Iterator
         Table(("missing column", "reason"), list(report["output"]["not_computed"].items())),
         Table(("column", "echoes", "value"), rows, title="Echoes without a value, by reason"),
     ])  # fmt: skip
-    yield Sheet("Provenance", _list_provenance(strip, report))
+    given, output, timing = report["input"], report["output"], report["timing"]
+    options = json.dumps({**report["options"], **report["request"]}, indent=2, sort_keys=True, ensure_ascii=False)
+    busy, wall = timing["processor_seconds"], timing["wall_seconds"]
+    rows = [[name, busy[name], wall[name]] for name in sorted(busy)]
+    yield Sheet("Provenance", [
+        Fact("strip", str(strip)),
+        Fact("input sha256 (sampled)", given.get("sha256_sampled", "")),
+        Fact("input bytes", given.get("size", 0)),
+        Fact("LAS", f"{found['las_version']}, point format {found['point_format']} -> {output['point_format']}"),
+        Fact("packet vectors", f"{found['direction']['sign']} the sensor: {found['direction']['evidence']}"),
+        Fact("sensor position from", found["sensor"]["source"]),
+        Fact("cloud", f"{output['file']}, {output['size']:,} bytes"),
+        Fact("wavebatch", report["version"]),
+        Sheet("Chain as it was used", [Code(report["chain"])]),
+        Sheet("Options and request", [Code(options)]),
+        Sheet("Time", [Table(("task", "processor [s]", "wall [s]"), rows)]),
+    ])  # fmt: skip
 
 
 def count_tables(counts: Mapping[str, Any], points: str) -> list[Table]:
@@ -286,20 +302,3 @@ def flag_table(counts: Mapping[str, Any]) -> Table:
     rows = [(flag.name, number, number / points if points else None, meaning)
             for flag, meaning in FLAG_MEANINGS.items() for number in [counts["flags"][flag.name]]]  # fmt: skip
     return Table(("flag", "points", "share", "meaning"), rows, ".2%", sortable=True)
-
-
-def _list_provenance(strip: Path, report: Mapping[str, Any]) -> Iterator[Part]:
-    found, given, output, timing = report["strip"], report["input"], report["output"], report["timing"]
-    yield from (Fact("strip", str(strip)), Fact("input sha256 (sampled)", given.get("sha256_sampled", "")))
-    yield Fact("input bytes", given.get("size", 0))
-    yield Fact("LAS", f"{found['las_version']}, point format {found['point_format']} -> {output['point_format']}")
-    yield Fact("packet vectors", f"{found['direction']['sign']} the sensor: {found['direction']['evidence']}")
-    yield Fact("sensor position from", found["sensor"]["source"])
-    yield Fact("cloud", f"{output['file']}, {output['size']:,} bytes")
-    yield Fact("wavebatch", report["version"])
-    yield Sheet("Chain as it was used", [Code(report["chain"])])
-    options = json.dumps({**report["options"], **report["request"]}, indent=2, sort_keys=True, ensure_ascii=False)
-    yield Sheet("Options and request", [Code(options)])
-    busy, wall = timing["processor_seconds"], timing["wall_seconds"]
-    rows = [[name, busy[name], wall[name]] for name in sorted(busy)]
-    yield Sheet("Time", [Table(("task", "processor [s]", "wall [s]"), rows)])
