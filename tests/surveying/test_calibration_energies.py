@@ -111,9 +111,7 @@ def test_logs_that_stand_still_or_drift_alone_are_named_and_in_the_error(tmp_pat
     assert np.mean(np.abs(off) < stated) > 0.6
 
 
-@pytest.mark.parametrize(
-    ("weak", "error"), [(0.75, 1 / 3), pytest.param(1.0, 0.065, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("weak", "error"), [(0.75, 1 / 3), (1.0, 0.065)])
 def test_pulses_whose_energy_is_not_logged_have_an_error_by_their_light(tmp_path, flickering, rng, weak, error):
     """They counted as of mean energy: a laser that was 25 % weaker there had 5 % of error, in silence."""
     gone = rng.uniform(size=8000) < 0.4

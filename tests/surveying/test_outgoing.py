@@ -1,5 +1,7 @@
 """The pulse that was sent against the pulse that echoes show: which is taken, and energies without being asked for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -124,9 +126,11 @@ def strip(tmp_path, rng):
     return _strip(tmp_path / "s.las", energies), energies
 
 
-def _filled(path, request):
+def _filled(path, request, brighter=None):
     with StripReader(path) as reader, reader.scan() as scan:
         energy = find_pulse_energy(reader, scan, request)
+        if brighter is not None:  # the mean of the calibration over that of the strip
+            energy = replace(energy, reference=brighter * energy.mean)
         blocks = [
             block if energy is None else energy.fill(block, unit)
             for unit in reader.read_units(scan)
@@ -145,6 +149,9 @@ def test_the_column_of_an_import_is_used_without_being_asked_for(strip):
     assert np.allclose(energy[known], energies[known] / mean, atol=1e-6) and np.allclose(error[known], 0.01 / mean)
     # An unknown one counts as it would without the column: mean energy, known to what it varies by.
     assert np.all(energy[~known] == 1) and np.allclose(error[~known], np.nanstd(energies) / mean)
+    # Under a calibration of pulses twice as strong it counts half, and so does its error.
+    half, doubt = _filled(path, None, brighter=2.0)
+    assert np.allclose(half, energy / 2) and np.allclose(doubt, error / 2)
     assert _filled(path, "none") is None
     energy, _ = _filled(path, "pulse_energy")
     assert np.isnan(energy[~known]).all()
