@@ -351,6 +351,27 @@ def test_packets_of_equal_time_are_one_pulse_where_they_lie_on_one_line(edit_poi
         np.testing.assert_array_equal(np.bincount(total), np.bincount(most))
 
 
+def test_points_that_are_stored_twice_do_not_count_as_returns(edit_points, tmp_path):
+    """Overlapping tiles that were merged: pulses of two returns had four."""
+
+    def change(rows):
+        rows[-100:] = rows[:100]
+        return rows
+
+    simulate_strip("forest", tmp_path / "a.las", pulses=400, seed=2)
+    strip = edit_points(tmp_path / "a.las", tmp_path / "b.las", change)
+    clouds = []
+    for name in ("a", "b"):
+        assert run_one(tmp_path / f"{name}.las", tmp_path / name, format="las").error is None
+        clouds.append(read_cloud(tmp_path / name / f"{name}.las")[0])
+    twice = np.unique(read_cloud(strip)[0]["gps_time"][:98])
+    right, found = (cloud[np.isin(cloud["gps_time"], twice)] for cloud in clouds)
+    passed = (found["echo_flags"] & PASSED_THROUGH) > 0
+    assert np.count_nonzero(passed) > 95 and len(found) - len(right) > 95
+    numbers = [np.stack(split_numbers(rows[rows["amplitude"] > 0])) for rows in (right, found)]
+    np.testing.assert_array_equal(*(np.bincount(100 * total + number) for number, total in numbers))
+
+
 def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):
     prepared = prepare_strip(make_job(tiny_strip, points="returns"))
     with StripReader(tiny_strip) as reader:

@@ -213,9 +213,9 @@ def assemble_echoes(
     places = np.where(absent, locate(records, layout.source.header), xyz) if absent.any() else xyz
     flags = np.append(table.flags, np.uint16(0))[echo] | reason
     pulse = _find_pulses(unit, echoes, layout.source.header)[owner]
-    # Pulses without any waveform, and rows that are not written, keep the numbers of the input.
+    # Pulses without any waveform, rows that are not written, and points that are stored twice keep the input's numbers.
     number, total = (given.astype(np.int64) for given in split_numbers(records))
-    kept = (flags & np.uint16(dropped)) == 0
+    kept = ((flags & np.uint16(dropped)) == 0) & ~((echo < 0) & _find_repeated(members, silent, found)[source])
     at: Any = slice(None) if kept.all() else np.flatnonzero(kept)
     numbers, count, known = number_returns(pulse[at], places[at], direction[at])
     number[at] = np.where(known, numbers, number[at])
@@ -287,6 +287,18 @@ def assemble_returns(
 def _bug(unit: Unit, what: str) -> StageError:
     last = unit.start + len(unit.points) - 1
     return StageError(f"points {unit.start} to {last}: {what}; please report it as a bug")
+
+
+def _find_repeated(members: _Members, silent: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Which of the returns without an echo repeat another one of their packet, bool (members,)."""
+    repeated, near = np.zeros(len(found), bool), np.zeros(max(members.packet.max(initial=-1), 0) + 2, bool)
+    near[members.packet[silent]] = True
+    rows = np.flatnonzero(near[members.packet])
+    fields = [members.source[name][rows] for name in ("return_point_wave_location", *"XYZ")]
+    order = np.lexsort((~found[rows], *fields, members.packet[rows]))
+    table = [values[order] for values in (members.packet[rows], *fields)]
+    repeated[rows[order[1:]]] = np.all([values[1:] == values[:-1] for values in table], axis=0)
+    return repeated & ~found
 
 
 def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarray:
