@@ -324,7 +324,15 @@ def error_factors(
     if not noise.correlation and level_err is None:
         return np.ones((len(width), 4))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    widths, factors, by_level = _factor_table(shape, limits, noise.correlation, noise.whitening)
+    # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
+    alone = 1.0 if noise.whitening else max(noise_factors(shape, limits.ref, noise.correlation)[0], 1.0)
+    widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
+    # Only those beside a width that is asked for: to make all takes a tenth of a survey.
+    near = np.searchsorted(widths, np.append(width[~np.isnan(width)], limits.ref))
+    widths = widths[max(near.min() - 1, 0) : near.max() + 1]
+    given = noise.correlation, noise.whitening
+    found = np.stack([_factors_at(shape, limits, at, *given) for at in widths.tolist()])
+    factors, by_level = found[:, 0] / alone, found[:, 1]
     if level_err is None:
         return interpolate(width, widths, factors)
     if noise.whitening:
@@ -335,18 +343,7 @@ def error_factors(
     return np.sqrt(found[:, :4] + found[:, 4:])
 
 
-@lru_cache(maxsize=16)
-def _factor_table(
-    shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...], whitening: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Widths (k,), the factors of errors there (k, 4), and what a wrong level adds to them (k, 4)."""
-    # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
-    alone = 1.0 if whitening else max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
-    widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
-    found = np.stack([_factors_at(shape, limits, float(width), correlation, whitening) for width in widths])
-    return widths, found[:, 0] / alone, found[:, 1]
-
-
+@lru_cache(maxsize=16 * FACTOR_WIDTHS)
 def _factors_at(
     shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...], whitening: tuple[float, ...]
 ) -> np.ndarray:

@@ -235,7 +235,7 @@ def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
     near = (known for known in known_systems() if abs(spacing / known.spacing - 1) < SAME_SPACING)
     found = [Likeness(known, compare_pulses(system, known.system)) for known in near]
     best = min(found, key=lambda one: one.difference, default=None)
-    if best is None:
+    if best is None or best.difference >= ALIKE:
         return None
     gaussian = SystemPulse(sigma_ref=gaussian_width(best.known.system))
     limit = min(ALIKE, NOT_A_GAUSSIAN * compare_pulses(best.known.system, gaussian))
