@@ -12,7 +12,7 @@ import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,6 @@ from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets, name_gains
-from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.system_file import format_survey
 from wavebatch.surveying.systems.known_systems import doubt_survey
 
@@ -298,9 +297,23 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines = [*prepared.scan.notes, *name_gains(prepared.facts, prepared.scan)]
     lines += filter(None, [prepared.sensor.doubt()])
     lines += prepared.job.calibration.notes if prepared.job.calibration else ()
-    lines += _find_gaps(prepared.sensor, report.no_data)
+    facts, no_data = dict(prepared.sensor.facts), report.no_data
+    # Echoes at times for which there is no position of the sensor, while others have one.
+    missing = {column: counts.get(NoData.NO_SENSOR.name, 0) for column, counts in no_data.items()}
+    columns = [name for name, number in sorted(missing.items()) if 0 < number < sum(no_data[name].values())]
+    if columns:
+        worst = max(columns, key=lambda name: missing[name])
+        reason, remedy = "rays from which the sensor's position follows are missing there", "give --trajectory"
+        if prepared.sensor.kind == "trajectory":
+            gaps = facts.get("gaps_s", [])
+            times = [f"{begin:.2f} to {end:.2f} s" for begin, end in gaps[:MOST_GAPS]]
+            times += [f"{len(gaps) - MOST_GAPS} more"] * (len(gaps) > MOST_GAPS)
+            reason, remedy = f"{facts['file']} has no position there", "give a trajectory that covers the strip"
+            if times:
+                reason += f" ({100 * (1 - facts['share_covered']):.2g} % of the strip's time: {', '.join(times)})"
+        number, total = missing[worst], sum(no_data[worst].values())
+        lines.append(f"{', '.join(columns)}: {number} of {total} echoes have none: {reason}; {remedy}")
     # An aircraft that is too fast: its strip may be in feet without saying so.
-    facts = dict(prepared.sensor.facts)
     named = any(unit.horizontal is not None for unit in prepared.facts.units)
     fast = prepared.sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST
     if fast and not (named and facts.get("height_m", 0.0) > JETS):
@@ -461,26 +474,6 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         found += warn("false-echoes", [line])
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
-
-
-def _find_gaps(sensor: SensorSource, no_data: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
-    """Echoes at times for which there is no position of the sensor, while others have one."""
-    missing = {column: counts.get(NoData.NO_SENSOR.name, 0) for column, counts in no_data.items()}
-    columns = [name for name, number in sorted(missing.items()) if 0 < number < sum(no_data[name].values())]
-    if not columns:
-        return
-    worst = max(columns, key=lambda name: missing[name])
-    number, total = missing[worst], sum(no_data[worst].values())
-    facts = dict(sensor.facts)
-    reason, remedy = "rays from which the sensor's position follows are missing there", "give --trajectory"
-    if sensor.kind == "trajectory":
-        gaps = facts.get("gaps_s", [])
-        times = [f"{begin:.2f} to {end:.2f} s" for begin, end in gaps[:MOST_GAPS]]
-        times += [f"{len(gaps) - MOST_GAPS} more"] * (len(gaps) > MOST_GAPS)
-        reason, remedy = f"{facts['file']} has no position there", "give a trajectory that covers the strip"
-        if times:
-            reason += f" ({100 * (1 - facts['share_covered']):.2g} % of the strip's time: {', '.join(times)})"
-    yield f"{', '.join(columns)}: {number} of {total} echoes have none: {reason}; {remedy}"
 
 
 def explain_absence(prepared: Prepared) -> dict[str, str]:

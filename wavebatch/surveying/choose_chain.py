@@ -262,31 +262,28 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
         found = request.system.survey
     block = sample[0] if sample else None
     if request.tolerance is not None:
-        return _choose_by_tolerance(block, found, request.tolerance, str(reader.facts.path))
+        from wavebatch.surveying.predict_error import leave_out_false, predict_errors
+
+        chains = {name: load_profile(name) for name in COSTS}
+        if block is None:
+            return ChainChoice(chains[COSTS[0]], found)
+        predictions = predict_errors(block, found.system, chains)
+        fitting = leave_out_false(predictions)
+        good = [prediction for prediction in fitting if prediction.range_error <= request.tolerance]
+        if not good:
+            errors = ", ".join(
+                f"{one.name} {one.range_error:.3g} m"
+                + ("" if one in fitting else f" ({100 * one.false_share:.0f} % of its echoes would be false)")
+                for one in predictions
+            )
+            raise ConfigError(
+                f"{reader.facts.path}: no shipped chain meets a tolerance of {request.tolerance:g} m; predicted errors "
+                f"are {errors}: allow more"
+            )
+        return ChainChoice(chains[good[0].name], found, predictions=tuple(predictions))
     if not request.auto:
         return ChainChoice(chain, found)
     return ChainChoice(choose_chain(found), found, decide(found))
-
-
-def _choose_by_tolerance(block: WaveformBlock | None, found: Survey, tolerance: float, strip: str) -> ChainChoice:
-    from wavebatch.surveying.predict_error import leave_out_false, predict_errors
-
-    chains = {name: load_profile(name) for name in COSTS}
-    if block is None:
-        return ChainChoice(chains[COSTS[0]], found)
-    predictions = predict_errors(block, found.system, chains)
-    fitting = leave_out_false(predictions)
-    good = [prediction for prediction in fitting if prediction.range_error <= tolerance]
-    if not good:
-        errors = ", ".join(
-            f"{one.name} {one.range_error:.3g} m"
-            + ("" if one in fitting else f" ({100 * one.false_share:.0f} % of its echoes would be false)")
-            for one in predictions
-        )
-        raise ConfigError(
-            f"{strip}: no shipped chain meets a tolerance of {tolerance:g} m; predicted errors are {errors}: allow more"
-        )
-    return ChainChoice(chains[good[0].name], found, predictions=tuple(predictions))
 
 
 def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request: Request) -> ChainChoice:

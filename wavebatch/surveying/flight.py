@@ -187,7 +187,18 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     waveforms are surveyed together, and all strips are compared with the result. Those that fit are surveyed again,
     until the group stays.
     """
-    kinds = _agree_on_kinds(samples)
+    # What each descriptor index means in most strips; of two meanings with as many, that of more waveforms.
+    votes: dict[int, dict[Kind, list[int]]] = {}
+    for sample in samples:
+        counts: Counter[tuple[int, Kind]] = Counter()
+        for block in sample.blocks:
+            counts[block.digitizer.index, kind_of(block)] += len(block)
+        for (index, kind), number in counts.items():
+            votes.setdefault(index, {}).setdefault(kind, []).append(number)
+    kinds = {
+        index: max((len(numbers), sum(numbers), kind) for kind, numbers in meant.items())[2]
+        for index, meant in sorted(votes.items())
+    }
     group, seen = _find_group([sample for sample in samples if not _compare_kinds(sample.blocks, kinds)], spread)
     for _ in range(ROUNDS):
         blocks = [block for sample in group for block in sample.blocks]
@@ -257,21 +268,6 @@ def _hold(
         pulse = compare_echoes(look, whole) if kind else compare_looks(look, whole, system)
     reason = "; ".join(filter(None, (pulse, kind)))
     return Held(sample.path, sample.fingerprint, sample.waveforms, None if kind else look, reason, sample.facts)
-
-
-def _agree_on_kinds(samples: Sequence[StripSample]) -> dict[int, Kind]:
-    """What each descriptor index means in most strips; of two meanings with as many, that of more waveforms."""
-    votes: dict[int, dict[Kind, list[int]]] = {}
-    for sample in samples:
-        counts: Counter[tuple[int, Kind]] = Counter()
-        for block in sample.blocks:
-            counts[block.digitizer.index, kind_of(block)] += len(block)
-        for (index, kind), number in counts.items():
-            votes.setdefault(index, {}).setdefault(kind, []).append(number)
-    return {
-        index: max((len(numbers), sum(numbers), kind) for kind, numbers in kinds.items())[2]
-        for index, kinds in sorted(votes.items())
-    }
 
 
 def _compare_kinds(blocks: Iterable[WaveformBlock], kinds: Mapping[int, Kind]) -> str:

@@ -291,25 +291,19 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     else:
         part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
-    widths = LevelWidths(scatter=_measure_scatter(part, system, echoes))
+    # Scatter of the widths of clear echoes of one width beyond the errors of their fits [ns]: from those narrower than
+    # the system pulse, since slopes and plants only widen.
+    below, scatter = find_single(echoes, len(part), system) & (echoes.sigma < system.sigma_ref), 0.0
+    if np.count_nonzero(below) >= ENOUGH_TO_LEARN:
+        lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
+        excess = np.median(lack**2) / SQUARED_NORMAL_MEDIAN - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
+        scatter = float(np.sqrt(max(excess, 0.0)))
+    widths = LevelWidths(scatter=scatter)
     system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)
     system = measure_skew(part, system, echoes) if learn else system
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
     return Survey(system, len(block), figures, decisions, candidates)
-
-
-def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
-    """Scatter of the widths of clear echoes of one and the same width beyond the errors of their fits [ns].
-
-    From those narrower than the system pulse: slopes and plants only widen. 0 with too few of them.
-    """
-    below = find_single(echoes, len(block), system) & (echoes.sigma < system.sigma_ref)
-    if np.count_nonzero(below) < ENOUGH_TO_LEARN:
-        return 0.0
-    lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
-    excess = np.median(lack**2) / SQUARED_NORMAL_MEDIAN - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
-    return float(np.sqrt(max(excess, 0.0)))
 
 
 def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figures: Figures) -> Figures:

@@ -253,14 +253,6 @@ LEAST_SKEW = 0.25
 """Skew of the strip's pulse from which the pulse t^2 exp(-t) of mode `pulse` describes it: it has 0.48 itself."""
 
 
-def _other_pulse(system: SystemPulse, mode: str) -> bool:
-    """Whether widths were fitted with another pulse than a mode compares them with: angles would be off by degrees."""
-    if mode == "system":
-        return system.other_pulse
-    symmetric = mode == "pulse" and system.skew is not None and system.skew < LEAST_SKEW
-    return bool(system.components) or abs(system.kappa) >= NO_SKEW or symmetric
-
-
 @stage(
     "attribute",
     makes=("incidence_angle", "incidence_angle_err"),
@@ -328,12 +320,17 @@ def incidence_angle(
         angle[clear], error[clear] = incidence.angles_above(*known, 1e-3 * beam if beam else np.nan, CLEAR_ERRORS)
     error = np.hypot(error, 0.5 * np.sin(2.0 * angle) * system.radiometry.divergence_error)
     unproven = np.isinf(system.widths.error or 0.0)
+    # Widths that were fitted with another pulse than the mode compares them with: angles would be off by degrees.
+    other = system.other_pulse
+    if mode != "system":
+        symmetric = mode == "pulse" and system.skew is not None and system.skew < LEAST_SKEW
+        other = bool(system.components) or abs(system.kappa) >= NO_SKEW or symmetric
     with np.errstate(invalid="ignore"):
         narrow = variance < -NARROW_ERRORS * variance_err
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NO_DIVERGENCE, not beam),
-        (NoData.OTHER_PULSE, _other_pulse(system, mode)),
+        (NoData.OTHER_PULSE, other),
         (NoData.NO_LEVEL, unproven),
         (NoData.SHORT_PULSE, short),
         (NoData.SHARED_PULSE, ~echoes.alone(len(block)) & alone),
