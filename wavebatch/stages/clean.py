@@ -84,7 +84,7 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
         signal -= offsets[np.arange(len(signal)) % len(offsets)][:, None]
     missing = None if block.missing is None else block.missing.T
     if defects.slope_spread > 0:
-        # Own slopes, drawn towards none by their errors.
+        # The sloping part of each baseline, 0 in its middle: own slopes, drawn towards none by their errors.
         reach = int(np.ceil(GUARD * system.sigma_ref / block.spacing))
         recovery = int(np.ceil(system.noise.recovery / block.spacing))  # a tail there would look like a slope
         slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing, recovery=recovery)

@@ -250,7 +250,7 @@ def _measure_class(
     """
     nothing, source = np.zeros(len(_MIDDLE)), number > 2 if company else number == 2
     pick = np.flatnonzero(source & ((echoes.flags & np.uint16(_CUT)) == 0))
-    near = 0
+    near = 0  # pairs of echoes of one waveform from NEAR to FAR apart
     for step in (1, 2, 3):
         gap = (echoes.time[step:] - echoes.time[:-step]) / system.sigma_ref
         same = (echoes.waveform[step:] == echoes.waveform[:-step]) & source[step:]

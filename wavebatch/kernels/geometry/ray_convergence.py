@@ -171,7 +171,6 @@ def fit_sensor(
     weight = np.ones(len(used)) if weight is None else np.asarray(weight, np.float64)[used]
     time = np.asarray(time, np.float64)[used]
     if len(used) < LEAST_PULSES:
-        # A fit that is not sound.
         size = 3 * (order + 1)
         empty = np.full((order + 1, 3), np.nan), np.full((size, size), np.nan)
         return SensorFit(0.0, 1.0, *empty, np.inf, np.nan, 0.0, np.nan, len(used))
@@ -181,6 +180,7 @@ def fit_sensor(
     ground = point[used] - origin
     powers = np.vander((time - centre) / half, order + 1, increasing=True)
     with np.errstate(all="ignore"):
+        # Least distances of the position from the lines, weighted by 1/R^2, without outliers.
         across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
         w = weight
         start = np.zeros((powers.shape[1], 3))

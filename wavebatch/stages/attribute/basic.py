@@ -49,7 +49,7 @@ def echo_width(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: 
     2.354820 sigma of a Gaussian, 2 sinh(1.17741 kappa) / kappa sigma of a skewed pulse. Of a learned pulse it is the
     width of the main lobe.
     """
-    # docs/algorithms.md 0
+    # Full width at half maximum per sigma of a skewed pulse (docs/algorithms.md 0); an echo may have its own skew.
     kappa = np.asarray(echoes.attributes.get("skew", system.kappa), np.float64)
     half = FWHM_PER_SIGMA / 2
     small = np.abs(kappa) < 1e-6

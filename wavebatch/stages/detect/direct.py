@@ -561,7 +561,7 @@ def zero_crossing(
     smoothed = smooth_121(found.signal)
     ref = system.sigma_ref / block.spacing
     if derivative == "first":
-        # From positive to zero or below.
+        # Where the slope goes from positive to zero or below.
         n = found.values.shape[1]
         falling = found.values[:-1] > 0
         falling &= found.values[1:] <= 0

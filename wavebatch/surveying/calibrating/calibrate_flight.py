@@ -472,7 +472,7 @@ def _assemble(
     known = np.isfinite(adjusted.value)
     channels: list[ChannelConstant] = []
     rows: list[StripConstant] = []
-    # Between strips of one channel; 0 where no channel has two.
+    # Standard deviation of a channel's constants between strips, logarithm; 0 where no channel has two.
     parts = [adjusted.value[known & (of == channel)] for channel in np.unique(of[known])]
     freedom = sum(len(part) - 1 for part in parts)
     squares = sum(float(np.sum((part - part.mean()) ** 2)) for part in parts)

@@ -340,7 +340,7 @@ def _find_zone(reader: StripReader, rows: np.ndarray, size: float) -> Zone:
     cosine.
     """
     rows, found = rows[:, np.argsort(rows[0], kind="stable")], []
-    # Pulses lie whole zones off their neighbours, or groups of them off the next.
+    # Do pulses lie whole zones off their neighbours, or groups of them off the next?
     groups = np.array_split(rows, max(rows.shape[1] // NEAR_PULSES, 1), axis=1)
     height = np.array([np.median(group[4]) for group in groups])
     zones = np.concatenate([(group[4] - at) / group[5] for group, at in zip(groups, height, strict=True)]) / size
