@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -109,7 +109,26 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
     _note_counts(found.figures, raw)
     found.figures.descriptors_pooled = float(len(members))
     if others:
-        found = _add_digitizers(found, plain, main, others, strangers, learn=learn)
+        # What each of the others records otherwise, and the scene that all see.
+        own_systems, counts, scenes, named = {}, [found.waveforms], [found.figures], []
+        for block, members in others:
+            own = found.system
+            strange = strangers.get(block.digitizer.index)
+            if strange or not _records_alike(plain, main, block):
+                own = _survey_other(found.system, block, learn=learn)
+                own_systems.update({member.digitizer.index: own for member in members})
+                reason = strange or "its bits, spacing, gain, offset, level, noise or pulse differ from the main one's"
+                named.append(Decision(f"digitizer {block.digitizer.index}", True, reason))
+            counts.append(len(block))
+            scenes.append(_describe(block, own, decompose_sample(block, own), Figures()))
+        names = ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share")
+        shares: dict[str, Any] = {
+            name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names
+        }
+        figures = replace(found.figures, **shares)
+        kept = (*_decide(found.system, main.spacing, figures, found.candidates), *named)
+        whole = replace(found.system, digitizers=own_systems)
+        found = Survey(whole, sum(counts), figures, kept, found.candidates)
     systems = {index: replace(own, seams=seams) for index, own in found.system.digitizers.items()}
     decisions = list(found.decisions)
     for length, at in sorted(seams.items()):
@@ -146,39 +165,6 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
         if reason:
             strangers[index] = reason
     return strangers
-
-
-def _add_digitizers(
-    found: Survey,
-    plain: SystemPulse,
-    main: WaveformBlock,
-    others: list[tuple[WaveformBlock, list[WaveformBlock]]],
-    strangers: Mapping[int, str],
-    *,
-    learn: bool,
-) -> Survey:
-    """The survey of the main digitizer with the others: what each records otherwise, and the scene that all see.
-
-    plain: Gaussian and noise of the main one, without its defects.
-    """
-    systems, counts, scenes, decisions = {}, [found.waveforms], [found.figures], []
-    for block, members in others:
-        own = found.system
-        strange = strangers.get(block.digitizer.index)
-        if strange or not _records_alike(plain, main, block):
-            own = _survey_other(found.system, block, learn=learn)
-            systems.update({member.digitizer.index: own for member in members})
-            reason = strange or "its bits, spacing, gain, offset, level, noise or pulse differ from the main one's"
-            decisions.append(Decision(f"digitizer {block.digitizer.index}", True, reason))
-        counts.append(len(block))
-        scenes.append(_describe(block, own, decompose_sample(block, own), Figures()))
-    names = ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share")
-    whole: dict[str, Any]
-    whole = {name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names}
-    figures = replace(found.figures, **whole)
-    system = replace(found.system, digitizers=systems)
-    kept = (*_decide(system, main.spacing, figures, found.candidates), *decisions)
-    return Survey(system, sum(counts), figures, kept, found.candidates)
 
 
 def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock) -> bool:

@@ -195,7 +195,26 @@ def fit_sensor(
             w = _keep(error, weight / distance**2)
         ahead = ground - powers @ start
         unit = np.where((np.einsum("ni,ni->n", unit, ahead) < 0)[:, None], -unit, unit)
-        found, normal, residual, left = _solve_angles(powers, ground, unit, weight, start)
+        # Angular Gauss-Newton from there; what outliers leave is 0.
+        found = start.copy()
+        for _ in range(_STEPS):
+            ahead = ground - powers @ found
+            distance = np.sqrt(np.einsum("ni,ni->n", ahead, ahead))
+            q = ahead / distance[:, None]
+            r = unit - q
+            error = np.einsum("ni,ni->n", r, r) * weight
+            w = _keep(np.sqrt(error), weight)
+            across = (np.eye(3) - q[:, :, None] * q[:, None, :]) * (np.sqrt(w) / distance)[:, None, None]
+            side = r - q * np.einsum("ni,ni->n", q, r)[:, None]
+            normal, right = _normal(powers, across, -side * (w / distance)[:, None])
+            step = _solve(normal, right)
+            found += step.reshape(found.shape)
+            if not np.abs(step).max() > 1e-7 * distance.max():
+                break
+        kept = w > 0
+        freedom = max(2 * int(kept.sum()) - found.size, 1)
+        residual = float(np.sqrt(error[kept].sum() / freedom))
+        left = side * np.sqrt(w)[:, None]
         ahead = ground - powers @ found
         distance = float(np.median(np.sqrt(np.einsum("ni,ni->n", ahead, ahead))))
     found[0] += origin
@@ -319,31 +338,6 @@ def _keep(error: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Weights, 0 for what lies beyond four robust standard deviations."""
     limit = CLIP * max(float(np.median(error)), 1e-12)
     return np.where(error <= limit, weight, 0.0)
-
-
-def _solve_angles(
-    powers: np.ndarray, ground: np.ndarray, unit: np.ndarray, weight: np.ndarray, found: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Angular Gauss-Newton from `found`: coefficients, normal equations, residual of a component at weight 1, and the
-    weighted residuals (n, 3), 0 for outliers."""
-    found = found.copy()
-    for _ in range(_STEPS):
-        ahead = ground - powers @ found
-        distance = np.sqrt(np.einsum("ni,ni->n", ahead, ahead))
-        q = ahead / distance[:, None]
-        r = unit - q
-        error = np.einsum("ni,ni->n", r, r) * weight
-        w = _keep(np.sqrt(error), weight)
-        across = (np.eye(3) - q[:, :, None] * q[:, None, :]) * (np.sqrt(w) / distance)[:, None, None]
-        side = r - q * np.einsum("ni,ni->n", q, r)[:, None]
-        normal, right = _normal(powers, across, -side * (w / distance)[:, None])
-        step = _solve(normal, right)
-        found += step.reshape(found.shape)
-        if not np.abs(step).max() > 1e-7 * distance.max():
-            break
-    kept = w > 0
-    freedom = max(2 * int(kept.sum()) - found.size, 1)
-    return found, normal, float(np.sqrt(error[kept].sum() / freedom)), side * np.sqrt(w)[:, None]
 
 
 def _redundancy(time: np.ndarray, unit: np.ndarray, left: np.ndarray) -> float:

@@ -339,7 +339,21 @@ def _leave_out_unknown(
         noise[rows] = larger[rows]
         order = np.arange(len(solution.number))
         order[rows] = len(order) + np.arange(len(rows))
-        fitted = _fit_again(samples, clusters, solution, again, rows, noise[rows])
+        # These clusters are fitted again from their echoes, in noise so much larger; errors are of noise alone.
+        factor = noise[rows]
+        old, waveform = solution.take(rows), clusters.waveform[rows]
+        amplitude, time, width, _ = old.parameters.T
+        place = np.arange(len(rows))
+        columns: Any = (None if column is None else column[waveform] for column in samples)
+        some = Samples(*columns)
+        some = some._replace(std=(some.std * factor).astype(np.float32))
+        first = np.cumsum(old.number) - old.number
+        windows = Clusters(place, clusters.low[rows], clusters.high[rows], first, old.number)
+        new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, again)
+        each = factor[new.cluster, None]
+        fitted = new._replace(
+            misfit=new.misfit * factor, cost=new.cost * factor**2, errors=new.errors / each, shared=new.shared / each**2
+        )
         solution = Solution(*map(np.concatenate, zip(solution, fitted, strict=True))).take(order)
         table = describe(clusters, solution)
     both = EchoTable.concatenate((rest, _leave_out_explained(table, solution)))
@@ -367,24 +381,6 @@ def _find_unknown(table: EchoTable, settings: Settings, noise: np.ndarray) -> np
     larger = np.zeros(len(noise))
     np.maximum.at(larger, cluster[unknown], factor[unknown])
     return larger
-
-
-def _fit_again(
-    samples: Samples, clusters: Clusters, solution: Solution, settings: Settings, rows: np.ndarray, factor: np.ndarray
-) -> Solution:
-    """Clusters at `rows` fitted again from their echoes, in noise `factor` (r,) as large; errors are of noise alone."""
-    old, waveform = solution.take(rows), clusters.waveform[rows]
-    amplitude, time, width, _ = old.parameters.T
-    place = np.arange(len(rows))
-    columns: Any = (None if column is None else column[waveform] for column in samples)
-    some = Samples(*columns)
-    some = some._replace(std=(some.std * factor).astype(np.float32))
-    windows = Clusters(place, clusters.low[rows], clusters.high[rows], np.cumsum(old.number) - old.number, old.number)
-    new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, settings)
-    each = factor[new.cluster, None]
-    return new._replace(
-        misfit=new.misfit * factor, cost=new.cost * factor**2, errors=new.errors / each, shared=new.shared / each**2
-    )
 
 
 ROUNDS = 3
