@@ -78,13 +78,14 @@ def list_sizes(files: Sequence[str]) -> list[int]:
     -------
     list of int
     """
-    sizes = []
-    for file in files:
-        try:
-            sizes.append(os.path.getsize(file))
-        except (OSError, ValueError):
-            sizes.append(-1)
-    return sizes
+    return [_size(file) for file in files]
+
+
+def _size(file: str) -> int:
+    try:
+        return os.path.getsize(file)
+    except (OSError, ValueError):
+        return -1
 
 
 _PROBE = "from wavebatch.batch.workers.worker_check import probe_arithmetic; print(probe_arithmetic())"
