@@ -330,5 +330,5 @@ def keep(clusters, solution, whole, factors, std, spacing, length, significance)
         flags |= EchoFlag.AT_BOUND if solution.at_bound[i] else EchoFlag(0)
         flags |= EchoFlag.OVERLAPPED if solution.number[c] > 1 else EchoFlag(0)
         rows.append((clusters.waveform[c], time * spacing, amplitude, width * spacing, errors[1] * spacing, errors[0],
-                     errors[2] * spacing, energies[i] * factors[i, 3], solution.misfit[c], int(flags), i))  # fmt: skip
+                     errors[2] * spacing, energies[i] * factors[i, 3], solution.misfit[i], int(flags), i))  # fmt: skip
     return rows

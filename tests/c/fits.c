@@ -81,17 +81,17 @@ static int run_case(const Case *c, const Strip *strip) {
         .known = 3, .whitened = c->whitened, .whitening = {{1.7, 0, 0}, {2, -1.2, 0}, {2.2, -1.7, 0.4}}};
     static int64_t number[WAVEFORMS];
     static uint8_t converged[WAVEFORMS], at_bound[WAVEFORMS * MOST_ECHOES];
-    static double misfit[WAVEFORMS], cost[WAVEFORMS], promise[WAVEFORMS];
+    static double misfit[WAVEFORMS * MOST_ECHOES], cost[WAVEFORMS], promise[WAVEFORMS];
     static double parameters[4 * WAVEFORMS * MOST_ECHOES], errors[4 * WAVEFORMS * MOST_ECHOES], shared[2 * WAVEFORMS * MOST_ECHOES];
-    Echoes echoes = {WAVEFORMS * MOST_ECHOES, number, converged, misfit, cost, parameters, errors, shared, at_bound};
+    Echoes echoes = {WAVEFORMS * MOST_ECHOES, number, converged, cost, misfit, parameters, errors, shared, at_bound};
     int64_t found;
     if (decompose_clusters(&block, &clusters, &settings, 0, &echoes, &found) != WAVEFORMS) return 1;
     if (promise_echoes(&block, &clusters, &settings, promise)) return 1;
     for (int64_t i = 0, at = 0; i < WAVEFORMS; i++) {
         printf("%s %d: %d echoes, converged %d,", c->name, (int)i, (int)number[i], converged[i]);
-        print_number(misfit[i]); print_number(cost[i]); print_number(promise[i]);
+        print_number(cost[i]); print_number(promise[i]);
         for (int64_t end = at + number[i]; at < end; at++) {
-            printf("; %d", at_bound[at]);
+            printf("; %d", at_bound[at]); print_number(misfit[at]);
             for (int q = 0; q < 4; q++) { print_number(parameters[4 * at + q]); print_number(errors[4 * at + q]); }
             print_number(shared[2 * at]); print_number(shared[2 * at + 1]);
         }

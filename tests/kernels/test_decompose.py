@@ -126,6 +126,20 @@ def test_no_broad_echo_bridges_two_others():
     assert np.mean(found.misfit > 2) <= 0.01
 
 
+def test_what_a_fit_leaves_is_counted_about_each_echo():
+    """A target that no echo describes says nothing about another one far away in the same fit."""
+    x = np.arange(LENGTH)
+    y = np.rint(60 * (np.abs(x - 12) < 4) + bell(36, 80) + np.random.default_rng(4).standard_normal((100, LENGTH)))
+    start = np.tile(np.array([[60.0, 80.0], [12.0, 36.0], [2.5, 2.0]]), (100, 1, 1))
+    found = decompose(y, start, std=1.04, grow=False)
+    amplitude, time, width, _ = found.parameters.reshape(100, 2, 4, 1).transpose(2, 0, 1, 3)
+    left = y - (amplitude * np.exp(-0.5 * ((x - time) / width) ** 2)).sum(axis=1)
+    near = np.abs(x - time) <= 4 * settings().width_ref
+    expected = np.sqrt((near * left[:, None] ** 2).sum(axis=2) / near.sum(axis=2)) / 1.04
+    np.testing.assert_allclose(found.misfit.reshape(100, 2), expected, rtol=1e-4)
+    assert np.median(expected[:, 0]) > 4 and np.median(expected[:, 1]) < 1.1
+
+
 def test_candidates_of_nothing_are_left_out():
     found = repeat(bell(20, 100) - bell(30, 8, 3.0), [20.0, 30.0], [100.0, 4.0])
     assert np.count_nonzero(found.number == 1) > 160

@@ -154,13 +154,13 @@ def test_chosen_solutions_are_those_of_a_loop(rng):
     for _ in range(3):
         number = rng.integers(0, 4, 12)
         m = number.sum()
-        per_cluster = rng.random(12) < 0.5, *rng.random((2, 12))
-        per_echo = *rng.random((2, m, 4)), rng.random((m, 2)), rng.random(m) < 0.5
+        per_cluster = rng.random(12) < 0.5, rng.random(12)
+        per_echo = rng.random(m), *rng.random((2, m, 4)), rng.random((m, 2)), rng.random(m) < 0.5
         solutions.append(Solution(number, *per_cluster, *per_echo))
     chosen = rng.integers(0, 3, 12)
     found = choose(solutions, chosen)
     for name in Solution._fields:
-        per_echo = name in ("parameters", "errors", "shared", "at_bound")
+        per_echo = name in ("misfit", "parameters", "errors", "shared", "at_bound")
         rows = []
         for cluster, which in enumerate(chosen):
             values = getattr(solutions[which], name)

@@ -33,7 +33,7 @@ def test_the_library_keeps_and_describes_echoes_as_the_loop(name, most, rng):
     number = rng.choice([0, 1, 1, 1, 2, 5], 300)
     c, m = len(number), int(number.sum())
     fitted, errors, shared = draw(rng, m, most)
-    solution = Solution(number, rng.random(c) < 0.9, rng.uniform(0.5, 3, c), np.zeros(c), fitted, errors, shared,
+    solution = Solution(number, rng.random(c) < 0.9, np.zeros(c), rng.uniform(0.5, 3, m), fitted, errors, shared,
                         rng.random(m) < 0.1)  # fmt: skip
     windows = np.zeros((4, c), np.int64)
     clusters = Clusters(np.sort(rng.integers(0, 200, c)), *windows)
@@ -60,7 +60,7 @@ def test_a_call_changes_no_fit_and_no_fits_give_no_echoes(rng):
     fitted, errors, shared = draw(rng, 3)
     errors[:] = 0.1
     one, kept = np.ones(1, np.int64), errors.copy()
-    solution = Solution(3 * one, one > 0, one * 1.0, one * 1.0, fitted, errors, shared, np.zeros(3, bool))
+    solution = Solution(3 * one, one > 0, one * 1.0, np.ones(3), fitted, errors, shared, np.zeros(3, bool))
     clusters = Clusters(*[0 * one] * 5)
     keep_echoes(clusters, solution, WholePulse(), np.full((3, 4), 2.0), np.ones(1, np.float32), 1.0, 80, 1.0)
     np.testing.assert_array_equal(errors, kept)
@@ -73,7 +73,7 @@ def test_a_call_changes_no_fit_and_no_fits_give_no_echoes(rng):
 def test_arrays_that_do_not_fit_are_refused(rng):
     fitted, errors, shared = draw(rng, 2)
     one = np.ones(1, np.int64)
-    solution = Solution(2 * one, one > 0, one * 1.0, one * 1.0, fitted, errors, shared, np.zeros(2, bool))
+    solution = Solution(2 * one, one > 0, one * 1.0, np.ones(2), fitted, errors, shared, np.zeros(2, bool))
     clusters, std = Clusters(*[0 * one] * 5), np.ones(1, np.float32)
     with pytest.raises(ValueError, match="differ in length"):
         keep_echoes(clusters, solution, WholePulse(), np.ones((1, 4)), std, 1.0, 80, 1.0)

@@ -169,7 +169,8 @@ class EchoTable:
     of both, which depends on how much the echo overlaps others. NaN where the decomposer has none.
     """
     residual: np.ndarray
-    """Root mean square of the fit's residuals in the echo's cluster, float32 (m,), in noise standard deviations."""
+    """Root mean square of what the fit leaves within four widths of the pulse of the echo, or in its window where it is
+    alone there, float32 (m,), in noise standard deviations."""
     flags: np.ndarray
     """EchoFlag bits, uint16 (m,)."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)

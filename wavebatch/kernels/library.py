@@ -89,7 +89,7 @@ class Echoes(ctypes.Structure):
 
     _fields_ = [
         *_fields(ctypes.c_int64, "room"),
-        *_fields(_POINTER, "number converged misfit cost parameters errors shared at_bound"),
+        *_fields(_POINTER, "number converged cost misfit parameters errors shared at_bound"),
     ]
 
 

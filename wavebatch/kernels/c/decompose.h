@@ -91,7 +91,7 @@ static int grow_window(const Settings *s, const Limits *limits, Work *work) {
         fit_window(k, 3, s, limits, k > 1 ? &width_prior : &none, target, work);
         if (work->fit.hopeless || (target < INFINITY && !(work->fit.cost < target))) return 0;
         if (leave_out_faint(work)) continue;
-        describe_fit(limits, work, &work->trial);
+        describe_fit(s, limits, work, &work->trial);
         if (target < INFINITY && !is_resolved(&work->trial)) return 0;
         exchange(&work->trial, &work->best);
         if (!work->fit.converged || !may_grow(s, &work->window) || k >= s->max_echoes) return 0;
@@ -190,7 +190,7 @@ static void leave_out_unknown(const Settings *s, Work *work) {
         if (!(amplitude > 0) || proof < least_fall(s, k - 1, fewer, noise) || proof < STEADY * STEADY * beside) {
             memset(work->known, 0, k * sizeof(double));
             memmove(before + least, before + least + 1, (k - 1 - least) * sizeof(double));
-            describe_fit(&limits, work, best);
+            describe_fit(s, &limits, work, best);
             asked = 0;
         } else {
             double more = noise * noise * (PROVEN * PROVEN / (amplitude * amplitude) - 1 / (error * error));
@@ -214,7 +214,7 @@ static void free_skews(const Settings *s, Work *work) {
     memcpy(work->fit.parameters, work->best.parameters, 3 * k * sizeof(double));
     for (int64_t j = 0; j < k; j++) work->fit.parameters[3 * k + j] = s->pulse.kind == SKEWED ? s->pulse.skew : 0;
     fit_window(k, 4, s, &limits, &prior, INFINITY, work);
-    describe_fit(&limits, work, &work->best);
+    describe_fit(s, &limits, work, &work->best);
 }
 
 /* The skews of log-normals follow from their widths and times. */
@@ -231,7 +231,7 @@ static void tied_skews(double origin, Solution *s) {
 
 static void write_echoes(const Solution *s, int64_t begin, int64_t cluster, int64_t at, const Echoes *out) {
     out->number[cluster] = s->k; out->converged[cluster] = s->converged;
-    out->misfit[cluster] = s->misfit; out->cost[cluster] = s->cost;
+    out->cost[cluster] = s->cost;
     for (int64_t j = 0; j < s->k; j++) {
         double *parameters = out->parameters + 4 * (at + j), *errors = out->errors + 4 * (at + j), *shared = out->shared + 2 * (at + j);
         for (int64_t q = 0; q < 4; q++) {
@@ -240,6 +240,7 @@ static void write_echoes(const Solution *s, int64_t begin, int64_t cluster, int6
         }
         parameters[1] += begin;
         shared[0] = s->shared[j]; shared[1] = s->shared[s->k + j];
+        out->misfit[at + j] = s->misfit[j];
         out->at_bound[at + j] = s->at_bound[j];
     }
 }

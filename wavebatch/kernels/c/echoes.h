@@ -86,7 +86,7 @@ EXPORT int64_t keep_echoes(const Clusters *clusters, const Echoes *fits, const W
             out->amplitude_err[kept] = (float)errors[0];
             out->sigma_err[kept] = (float)(errors[2] * keeping->spacing);
             out->relative_energy_err[kept] = (float)(root_of(a * a + w * w + 2 * shared[0] / (fitted[0] * fitted[2])) * factor[3]);
-            out->residual[kept] = (float)fits->misfit[c];
+            out->residual[kept] = (float)fits->misfit[row];
             out->flags[kept] = common | (fits->at_bound[row] ? FLAG_AT_BOUND : 0);
             out->row[kept++] = row;
         }

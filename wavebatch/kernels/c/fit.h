@@ -312,15 +312,28 @@ static void fit_window(int64_t k, int64_t per, const Settings *s, const Limits *
     else FOR_EACH_NUMBER(fit_echoes, s, limits, target, work);
 }
 
-/* The fit as a solution: errors, root mean square residual in noise, parameters that lie on their limits. */
-static void describe_fit(const Limits *limits, Work *work, Solution *out) {
+static const double NEAR = 4;                  /* widths of the pulse from an echo up to which what its fit leaves counts */
+
+/* Root mean square residual in noise about each echo; that of its window where it is alone. */
+static void measure_misfits(const Settings *s, const Work *work, double *misfit) {
     const int64_t k = work->fit.k, per = work->fit.per;
     const Window *w = &work->window;
-    const lanes *residual = work->rows + per * k * w->vectors;
+    const float *residual = (const float *)(work->rows + per * k * w->vectors), *x = (const float *)w->x;
+    for (int64_t j = 0; j < k; j++) {
+        const double time = work->fit.parameters[k + j], reach = k > 1 ? NEAR * s->width_ref : INFINITY;
+        double squares = 0;
+        int64_t used = 0;
+        for (int64_t i = 0; i < w->n; i++)
+            if (fabs(x[i] - time) <= reach && x[i] >= 0) { squares += (double)residual[i] * residual[i]; used++; }
+        misfit[j] = sqrt(squares / (used > 0 ? used : 1)) / w->std;
+    }
+}
+
+/* The fit as a solution: errors, what is left of each echo, parameters that lie on their limits. */
+static void describe_fit(const Settings *s, const Limits *limits, Work *work, Solution *out) {
+    const int64_t k = work->fit.k, per = work->fit.per;
     FOR_EACH_NUMBER(find_errors, work, out);
-    lanes squares = ALL(0);
-    for (int64_t v = 0; v < w->vectors; v++) squares += residual[v] * residual[v];
-    out->misfit = sqrt(sum_lanes(squares) / (w->used > 0 ? w->used : 1)) / w->std;
+    measure_misfits(s, work, out->misfit);
     out->k = k; out->per = per; out->converged = work->fit.converged; out->cost = work->fit.cost;
     memcpy(out->parameters, work->fit.parameters, per * k * sizeof(double));
     memset(out->at_bound, 0, k);

@@ -51,7 +51,8 @@ typedef struct { /* echoes of one cluster after the other; `room` of them fit */
     int64_t room;
     int64_t *number;                           /* per cluster */
     uint8_t *converged;
-    double *misfit, *cost;                     /* rms residual in noise; chi2 with prior */
+    double *cost;                              /* chi2 with prior */
+    double *misfit;                            /* per echo: rms residual about it, in noise */
     double *parameters, *errors;               /* per echo: amplitude, time, width, skew */
     double *shared;                            /* per echo: covariance of width with amplitude, and with time */
     uint8_t *at_bound;

@@ -22,8 +22,8 @@ typedef struct { /* k echoes with `per` parameters each: k amplitudes, then k ti
 typedef struct { /* a fit with its errors; laid out as `parameters` */
     int64_t k, per;
     int converged;
-    double cost, misfit;
-    double *parameters, *errors, *shared;
+    double cost;
+    double *misfit, *parameters, *errors, *shared;
     uint8_t *at_bound;
 } Solution;
 
@@ -68,8 +68,8 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
         && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->known, p * number) && enlarge(&w->frozen, p);
     Solution *all[] = {&w->trial, &w->best, &w->spare};
     for (int i = 0; i < 3 && good; i++)
-        good = enlarge(&all[i]->parameters, p * number) && enlarge(&all[i]->errors, p * number)
-            && enlarge(&all[i]->shared, p * number) && enlarge(&all[i]->at_bound, p);
+        good = enlarge(&all[i]->misfit, p * number) && enlarge(&all[i]->parameters, p * number)
+            && enlarge(&all[i]->errors, p * number) && enlarge(&all[i]->shared, p * number) && enlarge(&all[i]->at_bound, p);
     if (good) { w->room = k; w->vectors = vectors; memset(w->known, 0, p * number); }
     return good;
 }
@@ -78,6 +78,7 @@ static void free_work(Work *w) {
     void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->back, w->new_energy, w->rows, w->about, w->padded, w->coarse, w->energy,
         w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
         w->known, w->frozen, w->taps, w->edges, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
-        w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound};
+        w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound,
+        w->trial.misfit, w->best.misfit, w->spare.misfit};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) free(all[i]);
 }

@@ -147,10 +147,11 @@ class Solution(NamedTuple):
     """Number of echoes of each cluster, int64 (c,)."""
     converged: np.ndarray
     """Whether the fit of each cluster has converged, bool (c,)."""
-    misfit: np.ndarray
-    """Root mean square residual of each cluster in noise standard deviations, float64 (c,)."""
     cost: np.ndarray
     """chi2 plus prior of each cluster, float64 (c,)."""
+    misfit: np.ndarray
+    """Root mean square residual within four widths of the pulse of each echo [noise standard deviations], of its window
+    where it is alone there, float64 (m,)."""
     parameters: np.ndarray
     """Amplitude [count], time [samples of the waveform], width [samples], skew of each echo, float64 (m, 4)."""
     errors: np.ndarray
@@ -171,18 +172,18 @@ class Solution(NamedTuple):
         first = np.cumsum(self.number) - self.number
         number = self.number[rows]
         echo = np.arange(number.sum()) + np.repeat(first[rows] - (np.cumsum(number) - number), number)
-        return Solution(*(column[rows] for column in self[:4]), *(column[echo] for column in self[4:]))
+        return Solution(*(column[rows] for column in self[:3]), *(column[echo] for column in self[3:]))
 
 
 def choose(solutions: list[Solution], chosen: np.ndarray) -> Solution:
     """For each cluster the solution number `chosen`, int (c,), of solutions of the same clusters."""
-    per_cluster = (np.choose(chosen, fields) for fields in zip(*(s[:4] for s in solutions), strict=True))
+    per_cluster = (np.choose(chosen, fields) for fields in zip(*(s[:3] for s in solutions), strict=True))
     kept = [np.flatnonzero(chosen[solution.cluster] == i) for i, solution in enumerate(solutions)]
     cluster = np.concatenate([s.cluster[rows] for s, rows in zip(solutions, kept, strict=True)])
     order = np.argsort(cluster, kind="stable")
     per_echo = (
         np.concatenate([field[rows] for field, rows in zip(fields, kept, strict=True)])[order]
-        for fields in zip(*(s[4:] for s in solutions), strict=True)
+        for fields in zip(*(s[3:] for s in solutions), strict=True)
     )
     return Solution(*per_cluster, *per_echo)
 
@@ -213,18 +214,18 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
     problem = _as_problem(samples, candidates, clusters, settings)
     c = len(clusters.number)
     number, converged = np.zeros(c, np.int64), np.zeros(c, bool)
-    misfit, cost = np.zeros(c), np.zeros(c)
+    cost = np.zeros(c)
     room, done, parts = int(clusters.number.sum()) + c // 4 + 64, 0, []
     while done < c:
-        echoes = np.empty((room, 4)), np.empty((room, 4)), np.empty((room, 2)), np.empty(room, bool)
-        columns = (number, converged, misfit, cost, *echoes)
+        echoes = np.empty(room), np.empty((room, 4)), np.empty((room, 4)), np.empty((room, 2)), np.empty(room, bool)
+        columns = (number, converged, cost, *echoes)
         out = library.Echoes(room, *map(library.address, columns))
         found = ctypes.c_int64()
         reached = call("decompose_clusters", *problem, ctypes.c_int64(done), out, ctypes.byref(found))
         parts.append([column[: found.value] for column in echoes])
         room, done = 2 * room, reached
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)] if parts else _no_echoes()
-    return Solution(number, converged, misfit, cost, *joined)
+    return Solution(number, converged, cost, *joined)
 
 
 def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, settings: Settings) -> np.ndarray:
@@ -238,7 +239,7 @@ def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, set
 
 
 def _no_echoes() -> tuple[np.ndarray, ...]:
-    return np.empty((0, 4)), np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool)
+    return np.empty(0), np.empty((0, 4)), np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool)
 
 
 def _as_problem(
@@ -422,7 +423,7 @@ def keep_echoes(
     fits: list[np.ndarray] = [
         np.ascontiguousarray(column, kind) for column, kind in zip(solution, _SOLUTION, strict=True)
     ]
-    shapes = [(n,)] * 4 + [(m, 4), (m, 4), (m, 2), (m,), (m, 4), (n,)]
+    shapes = [(n,)] * 3 + [(m,), (m, 4), (m, 4), (m, 2), (m,), (m, 4), (n,)]
     if [column.shape for column in (*fits, factors, waveform)] != shapes or fits[0].sum() != m or (fits[0] < 0).any():
         raise ValueError("columns of fits, clusters or factors differ in length")
     if n and not 0 <= waveform.min() <= waveform.max() < len(std):

@@ -350,10 +350,11 @@ def _leave_out_unknown(
         first = np.cumsum(old.number) - old.number
         windows = Clusters(place, clusters.low[rows], clusters.high[rows], first, old.number)
         new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, again)
-        each = factor[new.cluster, None]
+        each = factor[new.cluster]
         fitted = new._replace(
-            misfit=new.misfit * factor, cost=new.cost * factor**2, errors=new.errors / each, shared=new.shared / each**2
-        )
+            misfit=new.misfit * each, cost=new.cost * factor**2, errors=new.errors / each[:, None],
+            shared=new.shared / each[:, None] ** 2,
+        )  # fmt: skip
         solution = Solution(*map(np.concatenate, zip(solution, fitted, strict=True))).take(order)
         table = describe(clusters, solution)
     both = EchoTable.concatenate((rest, _leave_out_explained(table, solution)))
