@@ -156,7 +156,7 @@ def kill(task, *arguments):
     os.kill(os.getpid(), signal.SIGKILL)
 
 if "TEST_KILLS" in os.environ:
-    strip_task.StripTask._open = kill  # the scan of the strip is done, its spool is there
+    strip_task.StripTask._take_prepared = kill  # the scan of the strip is done, its spool is there
 """
 """As sitecustomize: workers do not run the script of the user."""
 

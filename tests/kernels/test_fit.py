@@ -126,6 +126,15 @@ def test_samples_at_the_floor_only_bound_the_signal_from_above(rng, whitening):
     assert (fit(y, start, shape=shape, **TIGHT).cost > 3 * LENGTH).all()
 
 
+def test_samples_at_the_floor_count_where_the_model_is_above_them(rng):
+    truth = draw(rng, 6, 1)
+    y, start = record(rng, truth), near(rng, truth)
+    y[:, 12] = -5.0  # on the flank of each echo
+    found, plain = (fit(y, start, floor=floor, **TIGHT) for floor in (-5.0, None))
+    np.testing.assert_allclose(found.cost, plain.cost, rtol=1e-4)
+    assert (found.cost > 2 * LENGTH).all()
+
+
 def test_noise_that_grows_with_the_signal_weighs_samples(rng):
     truth = draw(rng, 8, 1)
     y, start = record(rng, truth), near(rng, truth)

@@ -10,6 +10,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
 from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, find_unexplained, flag_echoes
+from wavebatch.stages.pulse_tables import floor_level
 
 OVERLAPPED = int(EchoFlag.OVERLAPPED)
 ERRORS = "time_err", "amplitude_err", "sigma_err", "relative_energy_err"
@@ -227,3 +228,9 @@ def test_echoes_of_no_waveform_are_refused(table):
     last = replace(table, waveform=np.maximum(table.waveform, N - 1))
     with pytest.raises(ValueError, match="lies in no waveform"):
         flag_echoes(block, noise, SystemPulse(2.0), last)
+
+
+@pytest.mark.parametrize(("baseline", "spread", "floor"), [(2.9, 0.0, -np.inf), (3.1, 0.0, 0.0), (4.0, 1.0, -np.inf)])
+def test_count_0_is_a_floor_where_noise_does_not_reach_it(baseline, spread, floor):
+    noise = ReceiverNoise(std=2.0, baseline=baseline, baseline_spread=spread, by_kind={"quiet": 1.0})
+    assert floor_level(SystemPulse(2.0, noise=noise)) == floor

@@ -124,7 +124,7 @@ def test_descriptors_of_unlike_gains_are_named(tmp_path):
     """Half the amplitudes of a strip were twice as large as the others of the same ground in silence."""
     raw = make_raw()
     raw.points["wavepacket_index"][::2] += 1
-    for gain, named in ((1.0, False), (-1.0, False), (2.0, True)):
+    for gain, named in ((1.0, False), (-1.0, False), (1.0005, False), (2.0, True)):
         raw.vlrs = [descriptor(1), descriptor(2, gain=gain)]
         path = raw.write(tmp_path / f"{gain}.las")
         assert ("note: descriptors have gains of 1, 2 V per count" in run("check", path).stdout) == named

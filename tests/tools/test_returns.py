@@ -143,6 +143,14 @@ def test_points_beyond_the_number_of_returns_are_named_unless_scanners_tell_them
     assert all(line.startswith("crowded: 40 of 40 pulses have more points") for line in said)
 
 
+def test_counted_pulses_whose_points_are_missing_are_not_stored_twice(tmp_path):
+    """Without times, runs of rising return numbers grow together where points are missing."""
+    number = np.tile([1, 2, 3], 40)
+    found = count_returns([write_cloud(tmp_path / "c.las", np.zeros(120), -2.0 * number, number, np.full(120, 2))])[1]
+    assert found.incomplete and not any(line.startswith("crowded") for line in found.warnings)
+    assert any(line.startswith("incomplete") for line in found.warnings)
+
+
 def test_total_is_the_sum_of_the_files(tmp_path):
     path = write_cloud(tmp_path / "a.las", **SMALL)
     other = write_cloud(tmp_path / "b.las", **SMALL, flags=[EchoFlag.WEAK] * 7)

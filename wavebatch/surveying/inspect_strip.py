@@ -159,14 +159,18 @@ def _without_name(path: Path, error: Exception) -> str:
     return " ".join(str(error).split()).removeprefix(f"{path}: ")
 
 
+SAME_GAIN = 1e-3
+"""Relative difference up to which gains are the same: amplitudes have larger errors."""
+
+
 def name_gains(facts: StripFacts, scan: StripScan) -> Iterator[str]:
     """Say that counts of several descriptors do not compare, where these have other gains."""
     used = [digitizer for index, digitizer in facts.digitizers.items() if index in scan.by_descriptor]
     gains = sorted({abs(digitizer.gain) for digitizer in used} - {0.0})
-    if len(gains) > 1:
+    if gains and gains[-1] > (1 + SAME_GAIN) * gains[0]:
         yield (
             f"descriptors have gains of {', '.join(f'{gain:g}' for gain in gains)} V per count: amplitudes and "
-            "energies are in counts of each, and do not compare; `calibrate` gives each channel its constant"
+            "energies are in counts of each, and do not compare; `calibrate` gives each scanner channel its constant"
         )
 
 

@@ -347,6 +347,9 @@ _RANKS = name_ranks(15)
 _NOT_A_TIME = np.uint64(0x7FF8 << 48)
 """Bits of a NaN: above the key of every GPS time that is a number and at least 0."""
 
+_MOST_COUNTED = np.uint64(1 << 48)
+"""Above any number of a pulse that is counted, below the bits of any time."""
+
 _ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
 _SURE = 3.0
 """A sensor limit is reported if pulses with the most returns outnumber those with one less by so many standard
@@ -493,7 +496,7 @@ class _Tally:
     left_out: int = 0
     incomplete: int = 0
     crowded: int = 0
-    """Those of `incomplete` with more points than stored in them."""
+    """Those of `incomplete` with more points of one time than stored in them."""
     depth: float = 0.0
     methods: set[str] = field(default_factory=set)
     distances: np.ndarray = field(default_factory=lambda: np.zeros((len(RANKS), BINS), np.int64))
@@ -516,7 +519,10 @@ class _Tally:
         counts = np.diff(np.append(first, len(rows)))
         total = rows["total"][first]
         self.incomplete += int(np.count_nonzero(counts != total))
-        self.crowded += int(np.count_nonzero((counts > total) & (total > 0)))
+        # Runs of rising return numbers, where points have no time, grow together where points are missing.
+        key = rows["key"][first]
+        by_time = (key > _MOST_COUNTED) & (key < _NOT_A_TIME)
+        self.crowded += int(np.count_nonzero((counts > total) & (total > 0) & by_time))
         # Pulses with several returns, and the height of their first above their last return [m].
         last = np.append(first[1:], len(rows)) - 1
         with np.errstate(invalid="ignore", over="ignore"):

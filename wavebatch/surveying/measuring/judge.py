@@ -206,10 +206,16 @@ def find_own_width(explained: Explained, ref: float) -> float:
     strongest = np.zeros(len(explained.sums.left), np.float32)
     np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
     known &= echoes.amplitude >= 0.5 * strongest[echoes.waveform]
-    # A width at its limit repeats that, not the pulse's; unless most are there, and the pulse is narrower.
-    free = known & ((echoes.flags & np.uint16(EchoFlag.AT_BOUND)) == 0)
-    known = free if 2 * np.count_nonzero(free) > np.count_nonzero(known) else known
-    return find_edge(ratio[known], error[known]) if np.count_nonzero(known) >= LEAST_KNOWN else 1.0
+    if np.count_nonzero(known) < LEAST_KNOWN:
+        return 1.0
+    found = find_edge(ratio[known], error[known])
+    # Widths at the least that fits allow repeat that, not the pulse's, unless most are there: it is narrower.
+    least = known & (ratio < 1) & ((echoes.flags & np.uint16(EchoFlag.AT_BOUND)) != 0)
+    at_least = float(ratio[least].max(initial=0.0))
+    if found < (1 + KNOWN) * at_least and 2 * np.count_nonzero(least) < np.count_nonzero(known):
+        known &= ~least
+        found = find_edge(ratio[known], error[known])
+    return found
 
 
 def _measure_widths(echoes: EchoTable, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
