@@ -67,13 +67,13 @@ class NpzWriter(Closing):
             for name, spool in self._spools.items():
                 dtype = self._dtypes[name]
                 shape = (self._lengths[name], *dtype.shape)
-                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                with _open_member(archive, name) as member:
                     header = {"descr": dtype.base.str, "fortran_order": False, "shape": shape}
                     np.lib.format.write_array_header_1_0(member, header)
                     spool.seek(0)
                     shutil.copyfileobj(spool, member, _PIECE)
             for name, value in single.items():
-                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                with _open_member(archive, name) as member:
                     np.lib.format.write_array(member, np.array(value), allow_pickle=False)
         return self._draft
 
@@ -81,6 +81,11 @@ class NpzWriter(Closing):
         """Close and remove all temporary files; may be called after `publish`."""
         with contextlib.suppress(OSError):  # a full disk was reported when it was written to
             self._opened.close()
+
+
+def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    """New member with a fixed date."""
+    return archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
 
 
 MOST_HEADER = 4096
