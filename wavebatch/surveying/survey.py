@@ -22,6 +22,7 @@ from wavebatch.surveying.measuring.misfit import (
     MOST_FAINT,
     PEAK,
     cover_fits,
+    find_parts,
     limit_faint,
     measure_beside,
     measure_tail,
@@ -254,7 +255,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
-        system = measure_tail(block, system, clear)
+        system = find_parts(part, measure_tail(block, system, clear), echoes)
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)

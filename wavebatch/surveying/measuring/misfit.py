@@ -22,7 +22,7 @@ from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.judge import SURE
-from wavebatch.surveying.measuring.learn_pulse import part_strong
+from wavebatch.surveying.measuring.learn_pulse import MOST_STRONG, part_strong
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_strongest
 from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
 
@@ -68,6 +68,18 @@ LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says; less where the strip's echoes are so high that twice the
 noise is less."""
 
+
+PART, SAME_SHARE, LESS = 0.15, 0.35, 0.7
+"""Largest share of an echo that may be a part of its pulse; difference of the logarithms of two shares up to which they
+are the same, as noise moves them; and share over that of a part below which it is not this part."""
+
+SURELY, REPEATED, OFTEN = 6.0, 5, 2.0
+"""Errors of its amplitude by which an echo that has room is found, whatever the noise. Echoes that show a part, at
+least, and over those that would and do not: where one strong echo in ten has a neighbour of the same lag and share, as
+in dense canopies, five do so once in 100,000 such places."""
+
+ROOM = 2.5
+"""Widths of the pulse within which a higher echo hides a lower one."""
 
 PEAK, ABOVE_NOISE = 4.0, 3.0
 """Largest difference of a pulse from its model over the misfit, which is a mean over the echo; and noises that an echo
@@ -203,6 +215,68 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
         if is_part and share > min(LEAST_TAIL, 2 * left.noise):
             profile.append((float(place * system.sigma_ref), float(share)))
     return replace(system, tail_misfit=tuple(profile))
+
+
+def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+    """The system with the parts of its pulse that were decomposed as echoes: `tail_misfit`, where it has less.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    echoes : EchoTable
+        The block decomposed with its pulse, without any tail.
+
+    Notes
+    -----
+    Neighbours differ in lag and share from echo to echo. A part of the pulse is found with every echo that is so strong
+    that it must be, unless another echo is in its place (docs/algorithms.md R3).
+    """
+    ref = system.sigma_ref
+    least = SURELY * system.noise.std / np.sqrt(filter_energy(gaussian_taps(ref / block.spacing))) / echoes.amplitude
+    strong = np.flatnonzero(least < LESS * PART)
+    strong = strong[np.argsort(least[strong], kind="stable")[:MOST_STRONG]]
+    number = np.full(len(echoes), -1)
+    number[strong] = np.arange(len(strong))
+    pairs = [(number[other], echoes.amplitude[row] / echoes.amplitude[other], lag / ref)
+             for row, other, lag in list_neighbours(echoes)]  # fmt: skip
+    if not pairs:
+        return system
+    owner, share, lag = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    owner, share, lag = (column[owner >= 0] for column in (owner, share, lag))
+    least, time = least[strong], echoes.time[strong]
+    low, high = -time / ref, ((block.samples.shape[1] - 1) * block.spacing - time) / ref
+    must = (share < PART) & (least[owner] < share)
+    profile = dict(system.tail_misfit)
+    for place in range(-TAIL_BEFORE, TAIL_AFTER):
+        near = np.flatnonzero(np.abs(lag - place) <= ROOM)
+        here = near[np.abs(lag[near] - place) <= 1]
+        if abs(place) < 3 or np.count_nonzero(must[here]) < REPEATED:
+            continue
+        highest, beside = np.zeros((2, len(strong)))
+        np.maximum.at(highest, owner[here], share[here])
+        np.maximum.at(beside, owner[near], share[near])
+        whole = (low < place - 2) & (high > place + 2)
+        found = []
+        for middle in np.unique(np.round(log(share[here[must[here]]]), 1)):
+            part = float(exp(middle))
+            seen = whole & (least < LESS * part)
+            alike = seen & (np.abs(log(np.maximum(highest, 1e-9)) - middle) < SAME_SHARE)
+            without = np.count_nonzero(seen & (highest < LESS * part) & (beside < part / LESS))
+            # Higher echoes there are neighbours, and others of them are as high as the part: as many as in equal steps
+            # of the logarithm, or as in the next one.
+            above = log(highest[seen & (highest > part / LESS)]) - middle
+            chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
+            with_it = np.count_nonzero(alike)
+            if with_it >= max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1)):
+                found.append((with_it - without, alike))
+        if found:
+            alike = max(found, key=lambda one: one[0])[1]
+            part = float(np.quantile(highest[alike], 1 - NORMAL_BELOW[1]))  # targets and noise move it
+            around = np.unique(np.rint(lag[here[alike[owner[here]]]])[:, None] + (-1, 0, 1))
+            for at in around[np.abs(around) >= 3]:
+                profile[at * ref] = max(profile.get(at * ref, 0.0), part)
+    return replace(system, tail_misfit=tuple(sorted((float(lag), float(share)) for lag, share in profile.items())))
 
 
 class Seen(NamedTuple):
