@@ -15,8 +15,9 @@ def _run() -> None:
     import os
 
     _open_closed_streams()
-    from wavebatch.core.process import ONE_THREAD, importing
+    from wavebatch.core.process import ONE_THREAD, importing, keep_freed_memory
 
+    keep_freed_memory()  # a survey makes and frees 150 MB of arrays
     for name in ONE_THREAD:  # before NumPy is imported; what the user has set stays
         os.environ.setdefault(name, "1")
     with importing():

@@ -130,7 +130,7 @@ def see_swath(half_angle):
     back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
     block = replace(made.block, sensor=made.rays.ground - back)
     surveyed = survey_block(block).system.with_radiometry(divergence=SCENE.divergence)
-    return Slopes(block, made.rays.incidence, np.full(len(block), np.radians(0.3))), surveyed
+    return Slopes(block, lambda row: (made.rays.incidence[row], np.full(len(row), np.radians(0.3)))), surveyed
 
 
 @pytest.mark.parametrize("half_angle", [10.0, 25.0])
@@ -159,7 +159,7 @@ def test_a_digitizer_has_the_beam_of_its_strip_and_its_error():
 def test_a_reference_that_no_surface_shows_is_no_reference():
     block = simulate_seed_block(make_scene("empty"), 1, 0).block
     system = SystemPulse(2.0, radiometry=Radiometry(divergence=0.5))
-    unknown = Slopes(replace(block, sensor=block.origin), *np.full((2, len(block)), np.nan))
+    unknown = Slopes(replace(block, sensor=block.origin), lambda row: np.full((2, len(row)), np.nan))
     for samples in ([], [unknown], [unknown._replace(block=block)]):
         seen = measure_reference(samples, system, 1.0)
         assert np.isinf(seen.system.widths.error) and seen.divergence is None and seen.echoes == 0

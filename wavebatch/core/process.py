@@ -1,7 +1,7 @@
 """Memory, threads and time of a process.
 
-`keep_freed_memory` is called once at the start of each worker process, because kernels allocate the same few megabytes
-thousands of times. It changes speed only, never results.
+`keep_freed_memory` is called once at the start of each command and worker process, because kernels allocate the same
+few megabytes thousands of times. It changes speed only, never results.
 """
 
 from __future__ import annotations

@@ -13,8 +13,9 @@ you change it: stage attribute.incidence_angle must use the same limits, or pred
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,10 +76,9 @@ class Slopes(NamedTuple):
 
     block: WaveformBlock
     """With the sensor's positions."""
-    incidence: np.ndarray
-    """float64 (n,), rad; NaN where the points around form no plane."""
-    error: np.ndarray
-    """float64 (n,), rad."""
+    measure: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    """Angle and its standard deviation [rad] of some waveforms, by their rows (m,); NaN where the points around form no
+    plane. It takes longer than to find which echoes can use it."""
 
 
 @frozen
@@ -192,8 +192,10 @@ def _find_distance(around: Surroundings, some: np.ndarray, number: int, reach: f
     """Distance within which nine tenths of some points have so many points, with themselves; far beyond `reach` where
     that is not enough."""
     point, offset = around.find(some, reach)
-    square = (offset * offset).sum(axis=1)
-    square = square[np.lexsort((square, point))]
+    x, y, z = offset.T
+    square = x * x + y * y + z * z
+    order = np.argsort(square)
+    square = square[order[np.argsort(point[order].astype(np.int16), kind="stable")]]  # there are at most 1,000 points
     last = np.searchsorted(point, np.arange(len(some))) + number - 1
     near = np.bincount(point, minlength=len(some)) >= number
     distance = np.full(len(some), 1e9)
@@ -229,10 +231,17 @@ def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_wa
             place = np.full((len(block), 3), np.nan)
             if block.returns is not None:
                 place[block.returns.waveform] = block.returns.xyz
-            (angle, error), _ = measure_normals(
-                place, block.direction, around, radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR
-            )
-            yield Slopes(block, *(np.radians(values.astype(np.float64)) for values in (angle, error)))
+            yield Slopes(block, partial(_measure_angles, place, block.direction, around, radius))
+
+
+def _measure_angles(
+    place: np.ndarray, direction: np.ndarray, around: Surroundings, radius: float, row: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angles between rays and surfaces around places, as `Slopes` has them."""
+    (angle, error), _ = measure_normals(
+        place[row], direction[row], around, radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR
+    )
+    return np.radians(angle.astype(np.float64)), np.radians(error.astype(np.float64))
 
 
 def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: float) -> GroundReference:
@@ -307,7 +316,7 @@ def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform
     off = block.origin[row] + block.direction[row] * echoes.time[:, None] - np.asarray(block.sensor)[row]
-    angle, angle_err = sample.incidence[row], sample.error[row]
+    angle, angle_err = sample.measure(row)
     arm = 0.5 / C * np.sqrt((off * off).sum(axis=1))
     lever = (arm * np.tan(angle)) ** 2
     lever_err = 2.0 * arm * arm * np.tan(angle) / np.cos(angle) ** 2 * angle_err

@@ -254,10 +254,10 @@ class Surroundings:
         if not len(points) or not len(self._xyz):
             return np.empty(0, np.int64), np.empty((0, 3))
         points, side = np.ascontiguousarray(points, np.float64), radius * (1 + 1e-6)
-        if self._side != side:
+        if not side <= self._side <= 2 * side:  # larger cells serve too
             self._side = side
             cell = self._number_cells(self._xyz)
-            self._order = np.argsort(cell, kind="stable")
+            self._order = np.argsort(cell)
             self._cell, self._sorted = cell[self._order], self._xyz[self._order]
         # Neighbours are at most one cell away; cells along x follow each other.
         away = np.array([-1, 0, 1])
@@ -344,18 +344,17 @@ def _judge(
     apart, of, some = _take(offset, point, planes, rows)
     folded[rows] = misfit_of_angles(compare_halves(apart, of, some), some, unit[rows])
     surface &= ~((error <= max_error) & (np.hypot(error, folded) > max_error))
-    rows = np.flatnonzero(surface)
     untried = np.zeros(n, bool)
     # A plane through two scan lines only, which nothing could contradict.
-    apart, of, some = _take(offset, point, planes, rows)
-    away, u, v = (np.einsum("ki,ki->k", apart - some.centre[of], some.axes[of, :, axis]) for axis in range(3))
+    apart = apart - some.centre[of]
+    away, u, v = (np.einsum("ki,ki->k", apart, some.axes[of, :, axis]) for axis in range(3))
     near = np.abs(away) <= some.limit[of]
     untried[rows] = in_two_lines(u[near], v[near], of[near], len(rows))
     error = np.hypot(error, folded)
     gap = np.where(error <= max_error, Gap.KNOWN, Gap.UNCERTAIN)
     gap = np.where(angle > STEEPEST, Gap.TOO_STEEP, gap)
     gap = np.where(surface, gap, Gap.NO_PLANE)
-    gap = np.where((count < min_points) | untried, Gap.FEW_NEIGHBOURS, gap).astype(np.uint8)
+    gap = np.where((count < min_points) | (untried & surface), Gap.FEW_NEIGHBOURS, gap).astype(np.uint8)
     known = gap == Gap.KNOWN
     return np.where(known, angle, np.nan), np.where(known, error, np.nan), gap
 

@@ -355,7 +355,8 @@ def _common_level(own: np.ndarray, number: np.ndarray, covariance: np.ndarray) -
 
 def _may_be_lopsided(signal: np.ndarray, quiet: np.ndarray, covariance: np.ndarray) -> bool:
     """Whether noise is not as often above its level as below it, rounded off or cut off; or too few samples show it."""
-    cut = np.count_nonzero(quiet) < ENOUGH or float(np.mean(signal[quiet] == signal.min())) > MOST_LEAST
+    number = np.count_nonzero(quiet)
+    cut = number < ENOUGH or np.count_nonzero(quiet & (signal == signal.min())) > MOST_LEAST * number
     return bool(cut or covariance[0] < ROUNDED**2)
 
 
@@ -449,8 +450,7 @@ def measure_covariance(
     rest = sill - np.array(half)
     chance = CHANCE * sill / np.sqrt(pairs)
     if len(half) >= RISE and pairs[-1] >= LEAST_PAIRS:
-        variance = float(np.var(signal[quiet], dtype=np.float64))
-        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), variance)
+        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), signal, quiet)
         if slow is not None and slow[0] > (1 + SETTLED) * sill:
             return slow
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
@@ -471,7 +471,9 @@ def _pair_differences(
     return float(number), float(square)
 
 
-def _extend(half: np.ndarray, pairs: np.ndarray, lags: int, most: float) -> np.ndarray | None:
+def _extend(
+    half: np.ndarray, pairs: np.ndarray, lags: int, signal: np.ndarray, quiet: np.ndarray
+) -> np.ndarray | None:
     """Covariance (1 + lags,) of noise that forgets itself by one factor a sample, from a variogram that is too short.
 
     Its sill is what the variogram tends to, and at most the variance of all quiet samples, with that of their levels.
@@ -485,7 +487,7 @@ def _extend(half: np.ndarray, pairs: np.ndarray, lags: int, most: float) -> np.n
     best = int(np.argmin(np.einsum("fk,fk,k->f", rest, rest, pairs)))
     if (np.abs(rest[best]) > ALIKE_SHAPE / np.sqrt(pairs) * slow[-1]).any():
         return None
-    sill = min(float(size[best]) + QUANTISATION_STD**2, most)
+    sill = min(float(size[best]) + QUANTISATION_STD**2, float(np.var(signal[quiet], dtype=np.float64)))
     return np.r_[sill, sill - half, max(sill - half[-1], 0.0) * power[best, : lags - len(half)]]
 
 

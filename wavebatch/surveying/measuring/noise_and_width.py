@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.order import median
+from wavebatch.core.order import find_order, median
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
@@ -343,7 +343,8 @@ def find_single(echoes: EchoTable, n: int, system: SystemPulse, above: float = M
 
 def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the strongest echo of each waveform that has any, and the amplitude of the second strongest there."""
-    order = np.lexsort((-echoes.amplitude, echoes.waveform))
+    order = find_order(echoes.waveform, -echoes.amplitude)
+    order = np.arange(len(echoes)) if order is None else order
     waveform = echoes.waveform[order]
     first = np.r_[True, waveform[1:] != waveform[:-1]] if len(order) else np.empty(0, bool)
     second = np.zeros(n)
