@@ -2,7 +2,6 @@
 
 import os
 import re
-import signal
 import sys
 import textwrap
 import time
@@ -10,8 +9,6 @@ import time
 import attacking
 import pytest
 from attacking import Attack, Attacker
-
-import wavebatch
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks at processes through /proc")
 
@@ -68,34 +65,6 @@ def test_the_attacker_sees_every_kind_of_failure(attacker, code, why):
     assert re.search(why, planted.attack(Attack("survey", "TERM", 0.3)))
 
 
-_OWN = 'Traceback (most recent call last):\n  File "<frozen abc>", line 48, in <module>\nKeyboardInterrupt\n'
-_OURS = _OWN.replace("<frozen abc>", os.path.join(os.path.dirname(wavebatch.__file__), "core", "memory.py"))
-
-
-@pytest.mark.parametrize(
-    ("is_ready", "code", "said", "expected"),
-    [
-        (False, -2, "", True),
-        (False, 1, _OWN, True),
-        (False, 1, _OURS, False),
-        (False, 1, "error: no", False),
-        (False, 0, "", False),
-        (False, "hangs", "", False),
-        (True, 1, _OWN, False),
-        (True, -2, "", False),
-    ],
-)
-def test_only_what_python_says_before_our_code_runs_is_no_failure(attacker, is_ready, code, said, expected):
-    assert attacking.has_not_begun(is_ready, code, said) is expected
-    if not expected and code not in (0, "hangs"):
-        assert attacker._judge_end(Attack("run, 1 job", "INT", 0.1), is_ready, code, said)
-
-
-@pytest.mark.parametrize(("code", "said", "fails"), [(-9, _OWN, False), (-9, _OURS, True), (130, _OWN, True)])
-def test_python_may_say_that_the_parent_of_a_new_worker_was_killed(attacker, code, said, fails):
-    assert bool(attacker._judge_end(Attack("run, flight", "INT KILL", 0.1), True, code, said)) is fails
-
-
 @pytest.mark.slow
 def test_attacks_break_no_promise(tmp_path):
     seed = int(os.environ.get("FUZZ_SEED", "1"))
@@ -107,7 +76,3 @@ def test_attacks_break_no_promise(tmp_path):
 def test_every_kind_of_attack_on_a_batch(attacker, kind):
     for name, share in (("run, neighbours", 0.7), ("run, flight", 0.5)):
         assert attacker.attack(Attack(name, kind, share)) == ""
-
-
-def test_attacks_are_those_of_the_document():
-    assert {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL} == set().union(*attacking.SIGNALS.values())

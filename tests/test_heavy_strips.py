@@ -4,9 +4,8 @@ import random
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from heavy_strips import COMMANDS, MEMORY, MOST_BYTES, SHAPES, TOOLS, Plan, attack, build_strip, draw_plan, run_limited
+from heavy_strips import COMMANDS, MEMORY, TOOLS, Plan, attack, draw_plan
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="sets limits of memory and processor time")
 
@@ -37,26 +36,3 @@ def test_long_and_dense_waveforms_stay_within_memory_and_time(tmp_path, name):
 def test_random_heavy_strips_stay_within_memory_and_time(tmp_path, seed):
     rng = random.Random(seed)
     _all_hold(tmp_path, draw_plan(rng), [*COMMANDS, rng.choice(TOOLS)])
-
-
-def test_a_plan_gives_the_same_small_strip_each_time(tmp_path):
-    rng, kinds = random.Random(3), set()
-    for number in range(30):
-        plan = draw_plan(rng)
-        kinds |= {plan.shape, plan.bits, plan.point_format}
-        first, second = (build_strip(plan, tmp_path / f"{number}{name}.las") for name in "ab")
-        assert first.read_bytes() == second.read_bytes()
-        assert first.stat().st_size <= MOST_BYTES
-    assert {8, 16, 32} < kinds and len(kinds & set(SHAPES)) > 6
-
-
-def test_what_takes_too_much_is_noticed(tmp_path):
-    strip = build_strip(LONG._replace(samples=60), tmp_path / "a.las")
-    assert "exit code" in run_limited("info {strip}", strip, tmp_path / "out", seconds=0).wrong
-    assert run_limited("info {strip}", strip, tmp_path / "out", memory=100 << 20).wrong
-
-
-@pytest.mark.parametrize("shape", list(SHAPES))
-def test_shapes_are_counts_of_their_bits(shape):
-    counts = np.broadcast_to(SHAPES[shape](np.random.default_rng(1), 3, 200, 255), (3, 200))
-    assert np.isfinite(counts).all() and counts.min() >= 0 and counts.max() < 256

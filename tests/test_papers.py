@@ -3,22 +3,16 @@
 import importlib
 import re
 import shlex
-import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from html_tools import Page
 
-from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.tools.simulate import DiscreteReceiver
-
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
 README = FOLDER / "README.md"
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("s?_*.py"))
 
 
@@ -118,68 +112,6 @@ def test_the_paper_column_has_what_is_printed(load):
     assert models["table 3: Leica, mean of both classes, log-normal"] == "0.0083"
 
 
-def raise_echoes(s4, monkeypatch):
-    """Echoes of `synthesize` are .5 % too high."""
-
-    def raised(*known):
-        found = gaussian(*known)
-        return replace(found, amplitude=found.amplitude * np.float32(1.005))
-
-    monkeypatch.setattr(s4, "gaussian", raised)
-    return s4.table_of_synthesis(3000, 0)
-
-
-def add_energy(s4, monkeypatch):
-    """Waveforms of `synthesize` have 3 % too much energy."""
-    made = s4.synthesize_strip
-
-    def synthesize_more(cloud, strip, options, **known):
-        return made(cloud, strip, replace(options, gain=1.03 * options.gain), **known)
-
-    monkeypatch.setattr(s4, "synthesize_strip", synthesize_more)
-    return s4.table_of_footprints(3000, 0)
-
-
-def blind_longer(s4, monkeypatch):
-    """The receiver is blind for 3 mm more."""
-    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone + 0.003))
-    return s4.table_of_separations(s4.FULL, 0)
-
-
-def add_return(s4, monkeypatch):
-    """The receiver gives a fifth return."""
-    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone, most=5))
-    return s4.table_of_numbers(s4.FULL, 0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("fault", "failures"),
-    [
-        (raise_echoes, {"height of lone echoes over gain times intensity"}),
-        (add_energy, {"pulses of 1, shares of 1/1", "pulses of 2, shares of 1/2"}),
-        (blind_longer, {"0.64 m, least of 2-3", "0.67 m, least of 1-2"}),
-        (add_return, {"orion-20 m, numbers above 4", "gemini-24 m, numbers above 4"}),
-    ],
-)
-def test_small_faults_are_not_accepted(fault, failures, load, monkeypatch):
-    assert failures <= set(fault(load("s4_ussyshkin"), monkeypatch).failures)
-
-
-def test_the_profile_of_the_third_paper_has_its_table(load):
-    scripts = {"s2_jutzi": load("s2_jutzi")}
-    profile = str(scripts["s2_jutzi"].table_of_profile(1000, 0))
-    assert all(f" {value} " in profile for value in (20.4, 12.0, 30.6, 21.4, 0.216, 0.207, 0.236, 0.232))
-
-
-def test_figures_have_the_digits_that_they_deserve(load):
-    table = load("table").Table("things", 3, room=2.0)
-    table.near("share", 89.7276, 89.8, within=0.6, paper=86.7, digits=1)
-    table.near_share("of few", 0.31, 0.5, within=1.0, paper="0.2..0.4")
-    assert table.rows[0] == ["share", "86.7", "-", "89.7", "88.6..91.0", "ok"]
-    assert table.rows[1] == ["of few", "0.2..0.4", "-", "0.310", "0.000..2.500", "ok"]
-
-
 def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):
     page = load("page")
     rows = [["figure", "1", "-", "2", "0..3", "ok"], ["b", "-", "-", "9", "1", "FAIL"]]
@@ -203,58 +135,6 @@ def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):
         assert paper.title in shown.headings
         notes = page.read_notes()[paper.script]
         assert len(notes) > 1 and all(len(note) > 40 and "|" not in note for note in notes)
-
-
-@pytest.mark.slow
-def test_the_page_is_shown_by_a_browser_without_complaints(load, tmp_path, monkeypatch):
-    """With real pictures of small strips: every one is loaded, as wide as the window or less, and nothing is wider."""
-    if BROWSER is None:
-        pytest.skip("no headless browser is installed")
-    page = load("page")
-    rows = [[f"figure {n}", "1.0000", "-", "2.0000", "100.0000..200.0000", "ok"] for n in range(3)]
-    monkeypatch.setattr(page, "measure", lambda *rest: ([{"title": "t", "rows": rows}, {"text": "| ### " * 40}], True))
-    parts, fine = page.build(None, 500, 0)
-    assert fine, [part for part in parts if "warning" in part]
-    page.write_page(tmp_path / "papers.html", "Papers", parts)
-    Page(tmp_path / "papers.html").check()
-    probe = (
-        "<script>addEventListener('load', () => { const p = [...document.querySelectorAll('img')];"
-        "document.title = [p.length, p.every((i) => i.naturalWidth > 300 && i.clientWidth > 100),"
-        "Math.max(...p.map((i) => i.getBoundingClientRect().right)) <= innerWidth,"
-        "document.documentElement.scrollWidth <= innerWidth].join(' '); });</script>"
-    )
-    opened = re.sub(r"script-src '[^']+'", "script-src 'unsafe-inline'", (tmp_path / "papers.html").read_text())
-    (tmp_path / "probe.html").write_text(opened.replace("</body>", f"{probe}</body>"))
-    command = [BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
-               f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]  # fmt: skip
-    pictures = sum(len(paper.pictures) for paper in page.PAPERS)
-    for name, width in (("papers", 1300), ("probe", 1300), ("probe", 520)):
-        target = (tmp_path / f"{name}.html").as_uri()
-        shown = subprocess.run(
-            [*command, f"--window-size={width},900", target], capture_output=True, text=True, timeout=300
-        )
-        assert shown.returncode == 0 and "CONSOLE" not in shown.stderr, shown.stderr
-        if name == "probe":
-            assert re.search(r"<title>(.*?)</title>", shown.stdout)[1] == f"{pictures} true true true"
-
-
-def test_an_older_page_is_replaced_and_another_file_is_kept(load, tmp_path, monkeypatch):
-    page = load("page")
-    monkeypatch.setattr(page, "build", lambda *rest: (["<p>x</p>"], True))
-    words = ["-o", str(tmp_path / "p.html")]
-    assert page.main(words) == page.main(words) == 0 and "<p>x</p>" in (tmp_path / "p.html").read_text()
-    (tmp_path / "p.html").write_text("mine")
-    with pytest.raises(page.ConfigError, match="is no report"):
-        page.main(words)
-
-
-def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):
-    page = load("page")
-    row = ["a", "-", "-", "1", "0..2", "ok"]
-    short, long = ({"title": "t", "rows": [row] * n} for n in (3, 20))
-    assert "<details" not in page.fold(short) and page.fold(long).startswith("<details><summary>t: 20 figures<")
-    wrong = page.fold({"title": "t", "rows": [row] * 19 + [[*row[:-1], "FAIL"]]})
-    assert wrong.startswith("<details open><summary>t: 20 figures, 1 not accepted<")
 
 
 @pytest.mark.quick_cases("draw_cases", "draw_peak")

@@ -68,12 +68,3 @@ def test_the_named_tests_exist_and_assert_something():
 
 def _asserts(node):
     return any(isinstance(one, ast.Assert) for one in ast.walk(node))
-
-
-def test_sentences_are_split_at_their_ends():
-    text = "# A\n\nOne, e.g. this. Two\nlines: `x`. **Bold.** Three.\n\n- item one. More.\n- two;\n\n"
-    text += "| a | b |\n|---|---|\n| 1 | c |\n"
-    assert split_sentences(text) == [
-        "One, e.g. this.", "Two lines: `x`.", "**Bold.** Three.", "item one.", "More.", "two;",
-        "| a | b |", "| 1 | c |",
-    ]  # fmt: skip
