@@ -321,7 +321,7 @@ def test_return_numbers_beyond_the_point_format_are_cut_and_flagged(tiny_strip, 
     assert cut == np.count_nonzero(found["gps_time"] == 77.25) - 15
 
 
-@pytest.mark.parametrize("how", ["scanner", "rounded", "sorted"])
+@pytest.mark.parametrize("how", ["scanner", "one line", "rounded", "sorted"])
 def test_packets_of_equal_time_are_one_pulse_where_they_lie_on_one_line(edit_points, tmp_path, how):
     """Lasers that fire together, and pulses of a rounded time, became one pulse; packets far apart several."""
 
@@ -332,10 +332,16 @@ def test_packets_of_equal_time_are_one_pulse_where_they_lie_on_one_line(edit_poi
             rows["wavepacket_offset"] += later
             rows["return_point_wave_location"] -= 1000.0 * later
             return rows[np.argsort(later, kind="stable")]
-        each = {"scanner": 2, "rounded": 10}[how]
+        each = 10 if how == "rounded" else 2
         rows["gps_time"] = 300_000_000.0 + pulse // each
-        if how == "scanner":
+        if how != "rounded":
             rows["classification_flags"] = pulse % each << 4
+        if how == "one line":  # each second pulse runs along the ray of the one before
+            one = np.unique(pulse // each, return_index=True)[1][pulse // each]
+            later = (rows["return_point_wave_location"] - rows["return_point_wave_location"][one]).astype(float)
+            for axis, vector in zip("XYZ", ("x_t", "y_t", "z_t"), strict=True):
+                rows[vector] = rows[vector][one]
+                rows[axis] = rows[axis][one] - np.rint(1000 * later * rows[vector])
         return rows
 
     simulate_strip("forest", tmp_path / "a.las", pulses=600, seed=2, options=StripOptions(point_format=9))

@@ -186,7 +186,7 @@ def test_measures_of_pulses_are_those_of_roots(shape):
     found = pulse_shape.measure_pulse(pulse_shape.PulseShape(**shape), 1.2, 4.0)
     for row in (0, 90, 199):
         expected = naive_fit.measure(shape, found.width[row])
-        assert (found.peak[row], found.half_width[row]) == pytest.approx(expected, abs=0.015)
+        assert (found.peak[row], found.half_width[row]) == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_one_gaussian_of_a_pulse_is_that_of_scipy():

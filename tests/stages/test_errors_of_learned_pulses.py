@@ -8,6 +8,7 @@ from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, Waveform
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import maximum
+from wavebatch.stages.pulse_tables import error_factors, shape_limits
 from wavebatch.surveying import survey_block
 
 BASELINE, NOISE = 48.0, 4.0
@@ -104,3 +105,14 @@ def test_whole_counts_are_no_correlation_no_tail_and_no_less_noise(unit):
     assert system.noise.std == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
     assert system.noise.correlation == pytest.approx(np.zeros(len(system.noise.correlation)), abs=0.02)
     assert system.noise.by_kind["quiet"] == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
+
+
+def test_factors_of_a_width_do_not_depend_on_the_others():
+    """They are made only at the places of a table that lie beside a width."""
+    system = SystemPulse(2.0, noise=ReceiverNoise(std=NOISE, correlation=(0.7, 0.4, 0.2)))
+    limits = shape_limits(system, 1.0)
+    widths = np.geomspace(limits.low, limits.high, 40)
+    every = error_factors(system, 1.0, widths, np.full(40, 0.1))
+    alone = [error_factors(system, 1.0, widths[i : i + 1], np.full(1, 0.1))[0] for i in range(40)]
+    np.testing.assert_array_equal(alone, every)
+    assert np.ptp(every, axis=0).min() > 0.1

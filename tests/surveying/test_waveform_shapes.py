@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from strangers import judge_strip
 
-from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.waveforms import Defects, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.defects import find_spikes
 from wavebatch.stages.chain import STAGES
@@ -17,6 +17,9 @@ from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measuring import learn_pulse
+from wavebatch.surveying.measuring.joint_pulse import stack_jointly
+from wavebatch.surveying.measuring.judge import explain
+from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
 
 BASE = 12.0
@@ -474,3 +477,33 @@ def test_close_pairs_of_one_distance_stay_two_where_the_pulse_does_not_change(nu
     system, echoes = decompose(digitize(signal, 4, noise=1.0))
     assert system.misfit < 0.005
     assert (echoes.count(1500)[:number] == 2).mean() > 0.75 and (echoes.count(1500)[number:] == 1).mean() > 0.99
+
+
+@pytest.fixture(scope="module")
+def undershoot():
+    """A system and waveforms whose receiver undershoots below count 0: samples there are cut off."""
+    noise = ReceiverNoise(baseline=20.0, std=1.0, by_kind={"quiet": 1.0})
+    system = SystemPulse(2.0, noise=noise, components=((1.0, 0.0, 2.0), (-0.4, 9.0, 3.0)))
+    rng, n = np.random.default_rng(30), 300
+    empty = WaveformBlock.from_samples(np.zeros((n, 90), np.uint8))
+    columns = np.arange(n), rng.uniform(25, 40, n), rng.uniform(90, 200, n), np.full(n, 2.0)
+    signal = render_own(empty, system, EchoTable.build(*columns), np.arange(n), n)
+    return system, digitize(signal, 30, noise=1.0, base=20.0)
+
+
+def test_samples_that_are_cut_off_at_count_0_are_no_misfit_of_lower_echoes(undershoot):
+    system, block = undershoot
+    cut = block.samples == 0
+    assert (cut.sum(axis=1) > 2).all()
+    left = subtract_echoes(block, system, decompose_sample(block, system))
+    assert (left[cut] <= 0).all() and np.abs(left).max() < 12
+    defects = Defects(pattern=(0.6, -0.6, 0.6, -0.6))
+    cleaned = clean_block(block, replace(system, defects=defects)).samples
+    assert (cleaned[cut] == 0).all() and np.abs(cleaned - block.samples)[~cut] == pytest.approx(0.6, abs=1e-5)
+
+
+def test_samples_that_are_cut_off_teach_no_pulse(undershoot):
+    system, block = undershoot
+    stack = stack_jointly(system, explain(block, system), 0.0, 1.0)
+    lowest = np.abs(stack.lag - 9.0) < 2
+    assert stack.error[lowest].min() > 5 * np.median(stack.error[np.abs(stack.lag) < 2])
