@@ -150,12 +150,6 @@ def log_parabola(smooth, at, width):
     return np.exp(c0 - c1**2 / (4 * c2)) * np.sqrt(1 + 0.5 / width**2), at - c1 / (2 * c2), width
 
 
-def correlate_antisymmetric(waveform, taps):
-    """One waveform correlated with taps ahead and their negatives behind, zero outside."""
-    whole = np.convolve(waveform, np.r_[taps[:0:-1], 0.0, -taps[1:]])
-    return whole[len(taps) - 1 :][: len(waveform)]
-
-
 def square_differences(waveform, reference):
     """ASDF of one waveform and one reference by its definition, for every lag at which they touch."""
     n, m = len(reference), len(waveform)

@@ -229,41 +229,6 @@ def grow(y, std, start, s, widths, clip, white=None, **shape):
     return best
 
 
-def start_errors(amplitude, width, std):
-    """Errors of amplitude and width of a start, by differences of the log-parabola by each sample around the peak."""
-    at = 12
-    peak = naive.pulse(np.arange(25.0), at, width) * amplitude
-
-    def start(samples):
-        # The pulse behind [1 2 1]/4 as the starts take it: a Gaussian of variance width^2 + 1/2.
-        wide = np.sqrt(width**2 + 0.5)
-        smooth = amplitude * width / wide * naive.pulse(np.arange(25.0), at, wide) + naive.smooth_121(samples - peak)
-        height, _, found = naive.log_parabola(smooth, at, width)
-        return np.array([height, found])
-
-    slopes = naive.differentiate(start, peak, 1e-6 * amplitude)
-    return std * np.sqrt((slopes**2).sum(axis=1))
-
-
-def stack(signal, amplitude, time, before, after, step):
-    """(lag, median, robust error of it) of the samples of all echoes in each step of the lag; five at least."""
-    bins = {}
-    for row, height, at in zip(signal, amplitude, time, strict=True):
-        for i, value in enumerate(row):
-            if -before <= i - at <= after and np.isfinite(value):
-                bins.setdefault(int((i - at + before) // step), []).append(value / height)
-    return [
-        ((number + 0.5) * step - before, np.median(values), len(values), values)
-        for number, values in sorted(bins.items()) if len(values) >= 5
-    ]  # fmt: skip
-
-
-def tail_reach(first, values, step, ratio):
-    """Samples behind an echo within which its tail is above the noise."""
-    above = [first + i * step for i, value in enumerate(values) if first + i * step >= 0 and abs(value) * ratio > 1]
-    return int(np.ceil(max(above) + step)) if above else 0
-
-
 def measure(shape, width):
     """Peak and the full width at half of it, of a sum of Gaussians: on a fine grid, by root finding."""
     def value(x):

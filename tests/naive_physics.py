@@ -16,16 +16,6 @@ def median(values):
     return (values[(len(values) - 1) // 2] + values[len(values) // 2]) / 2
 
 
-def slope_error(incidence, slope, directions=3600):
-    """Root mean square of cos(incidence) / cos(true angle) - 1 over surfaces that slope in any direction."""
-    ray = np.array([np.sin(incidence), 0.0, np.cos(incidence)])
-    off = []
-    for turn in 2 * np.pi * np.arange(directions) / directions:
-        normal = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
-        off.append(ray[2] / (ray @ normal) - 1)
-    return np.sqrt(np.mean(np.square(off)))
-
-
 def angle_of_spread(spread, distance, divergence):
     return math.copysign(1, spread) * math.atan(abs(spread) * LIGHT / 2 / (distance * divergence / 4))
 

@@ -94,6 +94,7 @@ def test_every_style_draws_a_column_and_hides_no_data():
         assert ramp.get("clip") == "1" and values == sorted(values) and values[0] > -9999
 
 
+@pytest.mark.quick_cases("laspy")  # tiles and rasters have tests of their own
 @pytest.mark.parametrize("title", list(RECIPES))
 def test_recipe(folder, title):
     text = RECIPES[title]

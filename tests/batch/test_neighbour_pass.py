@@ -144,13 +144,6 @@ def test_without_its_columns_there_is_no_second_pass(strips, tmp_path):
     assert COLUMNS[0] not in laspy.read(tmp_path / "slope.laz").point_format.dimension_names
 
 
-def test_only_the_error(strips, clouds, tmp_path):
-    run_strip(strips / "slope.las", tmp_path, columns=COLUMNS[1])
-    np.testing.assert_array_equal(
-        laspy.read(tmp_path / "slope.laz")[COLUMNS[1]], laspy.read(clouds[0] / "slope.laz")[COLUMNS[1]]
-    )
-
-
 _DIE = """
 import os, sys
 from wavebatch.batch import neighbour_pass
@@ -269,15 +262,6 @@ def test_memory_does_not_grow_with_the_points(tmp_path, place):
         second.close()
     assert peaks[1] < 1.3 * peaks[0]
     assert peaks[0] < 150e6
-
-
-def test_the_second_pass_is_not_told_as_units(strips, tmp_path):
-    chain = parse_chain(CHAIN, "test")
-    job = StripJob(strips / "slope.las", chain, columns=choose_columns(chain))
-    events = []
-    run_batch([job], RunOptions(tmp_path), events.append)
-    units = [(event["done"], event["of"]) for event in events if event["event"] == "unit"]
-    assert units == [(number + 1, units[0][1]) for number in range(len(units))] and len(units) == units[0][1]
 
 
 def test_strips_that_are_not_in_metres_are_refused(tmp_path):

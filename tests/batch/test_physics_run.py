@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +12,9 @@ from commands import run_command
 from strips import take_turns
 
 from wavebatch.core.units import HALF_C
-from wavebatch.core.waveforms import Radiometry, SystemPulse
-from wavebatch.stages.chain_file import load_profile
-from wavebatch.surveying.calibrating.calibration_files import format_calibration, parse_calibration
+from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import (
     Calibration,
-    with_physics,
 )
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
@@ -221,34 +217,6 @@ def test_relative_columns_are_written_on_request_and_say_so_in_the_file(tmp_path
     assert (columns(tmp_path / "out", "cross_section")[0] == -9999).all()
     assert set(told["counts"]["no_data"]["cross_section"]) == {"NOT_CALIBRATED"}
     assert any("cross_section: none of" in line and "relative_backscatter" in line for line in told["remarks"])
-
-
-@pytest.mark.parametrize("name", ["Stra\u00dfe.las", "\U0001f6f0 strip.las", '\x7f"\\.las'])
-def test_a_calibration_of_a_strip_of_any_name_comes_back(name):
-    assert parse_calibration(format_calibration(replace(FOUND, strip=name)), "cal").strip == name
-
-
-def test_calibration_files():
-    again = parse_calibration(format_calibration(FOUND), "cal")
-    assert replace(again, strip=FOUND.strip) == replace(FOUND)
-    written = tomllib.loads(format_calibration(FOUND))["section_constant"]
-    assert written == pytest.approx(np.pi / 4 * 1.1e-3**2 * 2.6e-8, rel=1e-12)
-    bare = parse_calibration('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n', "cal")
-    assert bare.divergence is None and bare.attenuation == 0.22
-    system = FOUND.apply(SystemPulse(2.0))
-    given = system.radiometry
-    assert (given.constant, given.divergence, given.attenuation) == (2.6e-8, 1.1, 0.3)
-    assert FOUND.apply(SystemPulse(2.0, radiometry=Radiometry(divergence=0.5))).radiometry.divergence == 0.5
-
-
-def test_chains_get_what_is_known_and_nothing_twice():
-    chain = load_profile("fast")
-    none = with_physics(chain, sensor=False, calibrated=False, divergence=False)
-    assert none is chain
-    full = with_physics(chain, sensor=True, calibrated=True, divergence=True)
-    assert with_physics(full, sensor=True, calibrated=True, divergence=True) is full
-    assert set(full.makes) - set(chain.makes) >= {"range", "cross_section", "reflectance", "incidence_angle"}
-    assert "cross_section" not in with_physics(chain, sensor=True, calibrated=True, divergence=False).makes
 
 
 @pytest.mark.quick_cases("-1.0-0.25-55")

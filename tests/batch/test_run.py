@@ -11,7 +11,7 @@ from writer_tools import read_provenance
 
 from wavebatch.batch.job import choose_columns
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.run import LEAST_MEMORY, plan_memory, plan_strip, run_batch
+from wavebatch.batch.run import LEAST_MEMORY, plan_memory, run_batch
 from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import ConfigError, InputError
@@ -225,16 +225,6 @@ def test_memory_decides_jobs_and_blocks():
         plan_memory(1, LEAST_MEMORY - 1)
 
 
-def test_the_plan_of_a_strip_touches_nothing(tiny_strip, tmp_path):
-    plan = plan_strip(make_job(tiny_strip), RunOptions(tmp_path / "out"))
-    assert plan["action"] == "write" and plan["points"] > 400 and plan["estimated_bytes"] > 0
-    assert not (tmp_path / "out").exists()
-    run_one(tiny_strip, tmp_path / "out")
-    assert plan_strip(make_job(tiny_strip), RunOptions(tmp_path / "out", resume=True))["action"] == "skip"
-    with pytest.raises(InputError, match="exists already"):
-        plan_strip(make_job(tiny_strip), RunOptions(tmp_path / "out"))
-
-
 def test_columns_are_chosen_and_added():
     chain = make_job("x.las").chain
     usual = choose_columns(chain)
@@ -266,13 +256,3 @@ def test_a_prepared_strip_travels_between_processes(tiny_strip):
     assert again.system == prepared.system and again.layout.dtype == prepared.layout.dtype
     assert again.job.options == RunOptions(profile="fast") and again.job.columns == prepared.job.columns
     prepared.scan.close()
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize("keep", [False, True])
-def test_las_and_laz_with_and_without_packets(tiny_strip, tmp_path, suffix, keep):
-    outcome = run_one(tiny_strip, tmp_path, format=suffix[1:], keep_packets=keep)
-    assert outcome.error is None
-    cloud, _ = read_cloud(tmp_path / f"tiny{suffix}")
-    assert len(cloud) == outcome.report.count("points_out")
-    assert ("wavepacket_offset" in cloud.dtype.names) == keep

@@ -12,8 +12,6 @@ from wavebatch.batch.counts import LEFT_OUT
 from wavebatch.core.condition import parse_condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.cloud_reader import CloudReader
-from wavebatch.files.cloud.point_filter import PointFilter
 
 
 def _run(strip, folder, **options):
@@ -140,17 +138,6 @@ def test_where_sees_the_numbers_without_dropped_echoes(riegl, full, tmp_path):
     assert sizes[np.isin(times, _whole_times(full[0]))].max() == 1
 
 
-@pytest.mark.quick_cases("options1")
-@pytest.mark.parametrize("options", [{"jobs": 2}, {"block_size": 77}])
-def test_the_same_bytes_for_any_jobs_and_blocks(wide_strip, riegl, tmp_path, options):
-    strip = wide_strip if "jobs" in options else riegl
-    chosen = {"where": "amplitude > 60", "drop_flags": "WEAK", "chain": "fast"}
-    for name, more in (("a", {}), ("b", options)):
-        _run(strip, tmp_path / name, **chosen, **more)
-    one, other = ((tmp_path / name / f"{strip.stem}.laz").read_bytes() for name in "ab")
-    assert one == other
-
-
 @pytest.mark.parametrize("names", ["wavebatch", "riegl", "asprs"])
 def test_columns_that_are_not_written_or_in_other_units_decide_all_the_same(riegl, full, tmp_path, names):
     las, _ = full
@@ -199,13 +186,6 @@ def test_columns_of_a_second_pass_decide_after_it(riegl, tmp_path):
     np.testing.assert_array_equal(first["incidence_angle_normals"], las["incidence_angle_normals"][chosen])
 
 
-def test_extra_bytes_of_the_strip_and_fields_can_be_named(leica, riegl, tmp_path):
-    las, _ = _run(leica, tmp_path / "all")
-    middle = float(np.median(las.intensity))
-    some, _ = _run(leica, tmp_path / "some", where=f"Intensity <= {middle} and 'scan angle' < 90 and GpsTime > 0")
-    np.testing.assert_array_equal(some.points.array["Z"], las.points.array["Z"][np.asarray(las.intensity) <= middle])
-
-
 def test_resume_redoes_a_cloud_of_another_selection(riegl, tmp_path):
     area = _area(tmp_path / "a.geojson", (0.0, 0.0, 1e7, 1e7))
 
@@ -222,37 +202,12 @@ def test_resume_redoes_a_cloud_of_another_selection(riegl, tmp_path):
     assert status(polygon=area) == "written"
 
 
-def test_an_area_in_another_crs_is_named(riegl, tmp_path):
-    _, report = _run(riegl, tmp_path, bbox=(9, 47, 10, 48))
-    assert any("outside the strip" in one["text"] and "another CRS" in one["text"] for one in report["warnings"])
-
-
 def test_the_summary_says_what_is_left_out(riegl, tmp_path):
     words = ["run", str(riegl), "-o", str(tmp_path), "--profile", "fast", "--where", "z > 1e6", "--drop-flags", "WEAK"]
     result = run_command(*words)
     assert result.exit_code == 0
     assert "-> 0 points; left out: " in result.output and " by --drop-flags, " in result.output
     assert "no point is written" in run_command(*words, "--overwrite", "--quiet").output
-
-
-@pytest.mark.parametrize(
-    ("names", "where"),
-    [("wavebatch", "echo_width < 4.5"), ("riegl", "'Echo Width' < 4.65"), ("pdal", "AMPLITUDE > 30 and z > 0")],
-)
-def test_conditions_of_a_cloud_read_as_those_of_its_run(full, riegl, tmp_path, names, where):
-    """One grammar and one resolution of names: `stats --where` takes what `run --where` would have written."""
-    some, _ = _run(riegl, tmp_path / "some", where=where, names=names)
-    _run(riegl, tmp_path / "all", names=names)
-    path = next((tmp_path / "all").glob("*.laz"))
-    with CloudReader(path) as reader:
-        keep = reader.plan(PointFilter.build(where=where))
-    raw = laspy.read(path).points.array
-    assert 0 < len(some.points) == np.count_nonzero(keep.test(raw, len(raw)) == 0)
-
-
-def test_api_refuses_a_wrong_condition(riegl, tmp_path):
-    with pytest.raises(ConfigError, match="--where: character"):
-        wb.run(riegl, tmp_path, where="z >")
 
 
 def test_the_workers_of_a_cluster_need_not_see_the_polygons(tiny_strip, tmp_path, monkeypatch):

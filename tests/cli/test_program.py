@@ -6,7 +6,6 @@ Completion in shells, and results that cannot be printed.
 """
 
 import inspect
-import json
 import os
 import re
 import select
@@ -27,7 +26,7 @@ import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli import command as program
-from wavebatch.cli.command import GROUPS, ProgramCommand, complete_files, group_options, roff
+from wavebatch.cli.command import GROUPS, ProgramCommand, complete_files, roff
 from wavebatch.cli.messages import log_is_open
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
@@ -94,14 +93,6 @@ def test_run_has_the_options_of_runoptions_and_python_the_same():
     assert names.keys() - OPTIONS.keys() == extra and keywords.keys() - OPTIONS.keys() == {"strips", "on_event"}
 
 
-def test_help_of_run_begins_with_the_options_that_most_need():
-    shown = invoke("run", "--help").stdout
-    headings = re.findall(r"(?m)^([A-Z][\w ]+):\n  -", shown)
-    assert headings[0] == "Options that most runs need"
-    first = shown.split(headings[0])[1].split(f"\n{headings[1]}:")[0]
-    assert len(re.findall(r"(?m)^  (?:-\w, )?--", first)) <= 11 and "--jobs" in first and "--crs" not in first
-
-
 @pytest.mark.parametrize(
     ("variable", "words"),
     [
@@ -149,14 +140,6 @@ def test_options_of_several_commands_mean_the_same():
         assert not any({old, new} <= names for old, new in program.OLD_NAMES.items()), title
 
 
-def test_options_that_share_a_name_stand_where_they_belong():
-    places = (("grid", "--crs", "Reading"), ("grid", "--column", "Options"), ("slice", "--most", "Options"))
-    for title, name, heading in places:
-        command = dict(_commands())[title]
-        groups = dict(group_options(command, click.Context(command, info_name=title)))
-        assert any(record[0].startswith(name) for record in groups[heading]), (title, name)
-
-
 def test_every_command_has_quiet_and_debug():
     for title, command in _commands():
         names = {name for option in command.params for name in option.opts}
@@ -168,12 +151,6 @@ def test_quiet_hides_what_is_written_but_no_warning(tiny_strip, tmp_path):
                    for name, words in (("a", ()), ("b", ("-q",))))  # fmt: skip
     assert loud.exit_code == still.exit_code == 0 and loud.stdout == still.stdout
     assert "a.toml: written" in loud.stderr and still.stderr == ""
-
-
-def test_the_tolerance_of_compare_has_another_name(tiny_strip):
-    found = invoke("compare", tiny_strip, tiny_strip, "--tolerance", "0.5")
-    assert found.exit_code == 0, found.stderr
-    assert "--tolerance is now --within" in found.stderr and "within 0.5 ns" in found.stdout
 
 
 def test_old_names_of_options_work_with_a_remark(tiny_strip, tmp_path):
@@ -523,10 +500,3 @@ def test_one_stage_shows_parameters_defaults_and_an_example_that_loads(name):
     assert all(other in text for other in PARTNERS.get(name, {}).values())
     chain = parse_chain("\n".join(tables), "example")
     assert example.strip() in effective(chain)
-
-
-def test_json_for_programs():
-    told = json.loads(_invoke("--json").stdout)
-    assert {stage["name"] for stage in told} == set(STAGES)
-    one = json.loads(_invoke("detect.maximum", "--json").stdout)[0]
-    assert one["parameters"]["threshold"]["default"] == STAGES["detect.maximum"].parameters["threshold"].default

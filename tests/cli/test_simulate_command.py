@@ -27,13 +27,6 @@ def test_strip_and_truth_are_written_and_counted(tmp_path):
     assert summary["pulses"] == 500
 
 
-def test_talk_is_on_stderr_and_can_be_silenced(tmp_path):
-    result = run("flat", "-o", tmp_path / "a.las", "--pulses", 20)
-    assert result.stdout == ""
-    assert "20 pulses" in result.stderr
-    assert run("flat", "-o", tmp_path / "b.las", "--pulses", 20, "-q").output == ""
-
-
 def test_every_option_reaches_the_recording(tmp_path):
     result = run(
         *("mixed", "-o", tmp_path / "s.las", "--truth", tmp_path / "t.npz", "--pulses", 300, "--seed", 9, "--bits", 16),

@@ -32,12 +32,6 @@ def test_to_numpy_has_a_field_per_column():
     assert table.time[1] == 1.0
 
 
-def test_to_numpy_of_no_echoes():
-    rows = EchoTable.empty().to_numpy()
-    assert rows.shape == (0,)
-    assert rows.dtype["waveform"] == np.int32
-
-
 def test_build_sorts_and_converts():
     table = make_table([3, 1, 1])
     assert table.waveform.tolist() == [1, 1, 3]
@@ -74,12 +68,3 @@ def test_flags_are_single_bits_with_a_meaning():
     assert all(FLAG_MEANINGS[flag] == flag.meaning for flag in EchoFlag)
     both = EchoFlag.WEAK | EchoFlag.MERGED
     assert pickle.loads(pickle.dumps(both)) == both == 4128
-
-
-def test_rows_are_taken_with_all_columns_of_an_attribute():
-    table = EchoTable.build([0, 0, 1], [1.0, 2.0, 3.0], [5.0, 6.0, 7.0], [1.0, 1.0, 1.0])
-    table = table.with_attributes(pair=np.arange(6.0).reshape(3, 2))
-    for rows in ([2, 0], slice(2, None, -2), np.array([2, 0])):
-        assert table.take(rows).attributes["pair"].tolist() == [[4.0, 5.0], [0.0, 1.0]]
-    with pytest.raises(IndexError):
-        table.take(np.array([True]))

@@ -12,18 +12,3 @@ def test_an_even_sample_is_every_nth_row_however_they_come(rng):
         assert sample.seen == 5000 and sample.step == 32
         for name, values in columns.items():
             assert np.array_equal(sample.read()[name], values[:: sample.step])
-
-
-def test_few_rows_are_all_kept_and_none_make_no_columns():
-    sample = EvenSample()
-    assert sample.read() == {}
-    sample.add({"value": np.arange(3)})
-    sample.add({"value": np.arange(2)})
-    assert sample.read()["value"].tolist() == [0, 1, 2, 0, 1]
-
-
-def test_a_sample_keeps_no_larger_array_alive():
-    data = np.zeros(1000, [("value", "f8"), ("rest", "u1", 100)])
-    sample = EvenSample()
-    sample.add({"value": data["value"]})
-    assert sample.read()["value"].base is None

@@ -16,16 +16,6 @@ def flight(rate=20.0, seconds=20.0, start=300_000_000.0):
     return time, xyz
 
 
-@pytest.mark.parametrize(("rate", "limit"), [(200.0, 1e-5), (20.0, 1e-5), (1.0, 0.01)])
-def test_interpolation(rate, limit):
-    path = Trajectory.build(*flight(rate))
-    time, xyz = flight(997.0, 18.0, 300_000_000.0)
-    inside = (time > path.time[2]) & (time < path.time[-3])
-    assert np.abs(path.at(time[inside]) - xyz[inside]).max() < limit
-    given = path.at(path.time)
-    assert given == pytest.approx(path.xyz, abs=1e-9)
-
-
 def test_nothing_is_said_outside_and_in_gaps():
     time, xyz = flight()
     keep = (time < 300_000_005.0) | (time > 300_000_009.0)
@@ -37,14 +27,6 @@ def test_nothing_is_said_outside_and_in_gaps():
     assert b == pytest.approx(300_000_009.0, abs=0.051)
     assert path.share_known(300_000_001.0, 300_000_004.0) == 1.0
     assert path.share_known(300_000_005.0, 300_000_009.0) == pytest.approx(0.0, abs=0.02)
-
-
-def test_order_and_doubles_do_not_matter():
-    time, xyz = flight()
-    mixed = np.random.default_rng(1).permutation(np.r_[np.arange(len(time)), 5, 6])
-    one, other = Trajectory.build(time, xyz), Trajectory.build(time[mixed], xyz[mixed])
-    np.testing.assert_array_equal(one.xyz, other.xyz)
-    np.testing.assert_array_equal(one.velocity, other.velocity)
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -178,18 +160,3 @@ def test_sbet_is_projected(tmp_path):
         read_trajectory(tmp_path / "s.sbet", crs="EPSG:4326")
     with pytest.raises(InputError, match="CRS of the strip is not understood"):
         read_trajectory(tmp_path / "s.sbet", crs="nonsense")
-
-
-def test_positions_beyond_all_places_are_dropped():
-    """Their squares overflow."""
-    time = np.array([0.0, 1.0, 2.0, 1e300, 4.0])
-    xyz = np.zeros((5, 3))
-    xyz[1] = 1e308
-    assert Trajectory.build(time, xyz).time.tolist() == [0.0, 2.0, 4.0]
-
-
-def test_positions_at_almost_the_same_time_are_dropped():
-    """Velocities of half of them overflow."""
-    time, xyz = np.array([0.0, 5e-324, 1.0, 1.0 + 2e-10, 2.0]), np.arange(15.0).reshape(5, 3)
-    built = Trajectory.build(time, xyz)
-    assert built.time.tolist() == [0.0, 1.0, 2.0] and np.isfinite(built.velocity).all()

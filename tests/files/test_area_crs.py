@@ -15,10 +15,8 @@ from commands import run_command
 from strips import add_record
 from writer_tools import data_file
 
-import wavebatch
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, plan_crs, read_area_file
+from wavebatch.files.geojson import AreaFile, load_polygons, place_rings, plan_crs, read_area_file
 from wavebatch.files.las.crs import build_utm, read_crs, read_crs_definition
 from wavebatch.files.las.header import Vlr, build_wkt, read_header
 from wavebatch.tools.scan_slices import Segment
@@ -140,12 +138,6 @@ def test_one_point_at_the_origin_does_not_make_degrees_coordinates_of_the_strip(
     assert placed.tolist() == place_rings(file, [box], strip, header)[0].tolist() and placed.min() > 1e5
 
 
-def test_extents_that_are_no_numbers_hold_nothing(plain):
-    broken = _local(plain, np.nan, np.nan)
-    with pytest.raises(InputError, match="is in degrees"):
-        place_rings(read_area_file("a.geojson", None, [_square(10, 80)]), [_square(10, 80)], plain, broken)
-
-
 def _square(low, high):
     return np.array([[low, low], [high, low], [high, high], [low, high]], np.float64)
 
@@ -203,21 +195,6 @@ def test_an_unknown_crs_is_one_line(strip, tmp_path):
     with pytest.raises(InputError, match="a.geojson: cannot be projected into the CRS of .*utm.las") as caught:
         polygon.place(strip, read_header(strip))
     assert "\n" not in str(caught.value)
-
-
-def test_both_extents_are_named(strip):
-    header = read_header(strip)
-    assert describe_miss([_box(strip)], header) == "" == describe_miss([], header)
-    text = describe_miss([_box(strip) + 1e5], header)
-    assert f"{_box(strip)[0, 0] + 1e5:.10g}" in text and f"{header.mins[0]:.10g}" in text and "another CRS" in text
-
-
-def test_a_bare_polygon_and_a_single_feature_are_geojson_too(strip, tmp_path):
-    shape = {"type": "Polygon", "coordinates": [_box(strip).tolist()]}
-    for document in (shape, {"type": "Feature", "properties": None, "geometry": shape}):
-        (tmp_path / "a.geojson").write_text(json.dumps(document))
-        (polygon,) = load_polygons(tmp_path / "a.geojson")
-        assert polygon.rings[0].tolist() == _box(strip).tolist()
 
 
 def test_a_crs_counts_wherever_it_stands(tmp_path):
@@ -285,21 +262,6 @@ def test_an_area_that_misses_the_strip_is_named_with_both_extents(strip, tmp_pat
     assert "no point is written" in result.stderr and "lies outside the strip (x " in result.stderr
     result = run_command("stats", strip, "--polygon", away)
     assert "lies outside the strip (x " in result.output
-
-
-def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_path):
-    degrees = _write(tmp_path / "deg.geojson", _project(_box(strip), "EPSG:32633", "EPSG:4326"))
-    chosen = PointFilter.build(polygon=degrees)
-    placed = chosen.place(strip, read_header(strip))
-    assert placed.describe() == chosen.describe() and placed.polygons != chosen.polygons
-
-
-def test_help_says_in_which_coordinates_areas_are():
-    for command, more in (("run", ""), ("stats", ""), ("calibrate", "in the coordinates of the strips only")):
-        result = run_command(command, "--help")
-        text = " ".join(result.output.split())
-        assert "in WGS 84, in the CRS that the file names, or in the coordinates of the" in text and more in text
-    assert "in the CRS that the file names" in wavebatch.run.__doc__
 
 
 POINTS = np.array([[500000.0, 5400000.0, 312.3456], [500010.0, 5400020.5, 301.0]])

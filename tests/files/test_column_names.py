@@ -36,12 +36,6 @@ def test_styles_name_columns_that_exist(style):
     assert set(STYLES[style]) <= set(COLUMNS)
 
 
-@pytest.mark.parametrize("taken", ["Amplitude", "AMPLITUDE", "amplitude"])
-def test_the_inputs_name_stays_and_ours_gets_a_prefix(taken):
-    (column,) = style_columns(["amplitude"], "wavebatch", [taken])
-    assert column.record.name == "wb_amplitude"
-
-
 def test_collisions_with_prefixed_names_separators_and_standard_fields():
     def named(columns, style, taken):
         return [column.record.name for column in style_columns(columns, style, taken)]
@@ -53,14 +47,6 @@ def test_collisions_with_prefixed_names_separators_and_standard_fields():
     assert named(["amplitude", "amplitude"], "opals", []) == ["Amplitude"]
     assert named(["x", "y", "z", "range"], "wavebatch", ["X"]) == ["range"]
     assert named(["range"], "pdal", []) == ["EchoRange"]
-
-
-def test_names_with_a_prefix_are_identifiers():
-    """PDAL takes only identifiers in its expressions."""
-    for style in STYLES:
-        taken = [column.record.name for column in style_columns(list(COLUMNS), style, [])]
-        again = [column.record.name for column in style_columns(list(COLUMNS), style, taken)]
-        assert all(name.isidentifier() and name.startswith("wb_") for name in again), again
 
 
 def test_no_data_of_floating_point_columns_can_be_nan():
@@ -98,16 +84,6 @@ def test_unknown_names_are_one_line():
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_stored_values_times_scale_are_the_values(style):
-    values = np.array([0.4, 4.449, 62.3, 99.99])
-    for column in style_columns(NUMBERS, style, ()):
-        stored = column.encode(values.astype(COLUMNS[column.column].dtype)).astype(float)
-        scale = column.naming.scale or 1.0
-        expected = 10 * np.log10(values) if column.naming.decibel else values
-        np.testing.assert_allclose(stored * scale, expected, atol=scale / 2 if column.naming.scale else 2e-5)
-
-
-@pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("name", NUMBERS)
 def test_what_is_no_number_becomes_the_declared_no_data(style, name):
     (column,) = style_columns([name], style, ())
@@ -126,12 +102,6 @@ def test_values_beyond_the_stored_type_become_its_nearest_value_never_no_data():
     ]  # fmt: skip
     (amplitude,) = style_columns(["amplitude"], "wavebatch", ())
     assert list(amplitude.encode(np.array([1e300, 1.0]))) == [-9999.0, 1.0]
-
-
-def test_flags_keep_their_bits():
-    (flags,) = style_columns(["echo_flags"], "wavebatch", ())
-    assert flags.record.no_data is None
-    assert list(flags.encode(np.array([0, 1, 65535], np.uint16))) == [0, 1, 65535]
 
 
 def test_exact_names_come_before_those_that_are_alike_and_kinds_count_in_order():

@@ -8,7 +8,6 @@ WKT from GeoTIFF keys: UTM zones to the letter of EPSG, and nothing that is not 
 import json
 import struct
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,10 +18,7 @@ from hypothesis import strategies as st
 from strips import add_record, descriptor, make_raw, vlr
 from writer_tools import data_file, plan_output, write_source
 
-from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
-from wavebatch.core.units import HALF_C
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.las.crs import (
     METRES,
@@ -31,7 +27,6 @@ from wavebatch.files.las.crs import (
     build_utm,
     convert_geotiff,
     find_code,
-    find_unit,
     looks_geocentric,
     parse_wkt,
     read_crs_definition,
@@ -40,7 +35,6 @@ from wavebatch.files.las.crs import (
 )
 from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_projection, read_header
 from wavebatch.files.strip.reader import StripReader, measure_scale
-from wavebatch.stages.attribute.basic import position
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import FlightLine
 from wavebatch.tools.simulate.strip import WKT
@@ -154,20 +148,6 @@ def test_units_that_nobody_knows_are_no_metres(directory, doubles):
 
 
 @pytest.mark.parametrize(
-    ("code", "unit"),
-    # NAD27 / New York, NAD83(2011) / Oregon (both), Palestine 1923, ETRS89 / UTM, Web Mercator, Texas, and no code.
-    [(32017, US), (6886, None), (6885, 0.3048), (28191, None), (25832, None), (3857, None), (2277, US), (0, None)],
-)
-def test_codes_of_crs_give_their_unit(code, unit):
-    assert find_unit(code) == (None if unit is None else pytest.approx(unit, rel=1e-7))
-
-
-def test_heights_have_codes_of_their_own():
-    assert find_unit(6360, vertical=True) == pytest.approx(US) and find_unit(5703, vertical=True) is None
-    assert find_unit(8228, vertical=True) == 0.3048 and find_unit(6360) is None
-
-
-@pytest.mark.parametrize(
     ("directory", "citation", "crs", "definition"),
     [
         (keys(short(1024, 1), short(3072, 2263), short(4096, 6360)), b"x|", "EPSG:2263+6360", "EPSG:2263"),
@@ -186,12 +166,6 @@ def test_the_code_of_geotiff_keys_is_the_name_of_the_crs(tmp_path, directory, ci
         assert reader.facts.crs == crs
         found = [read_crs_definition(reader.facts.path, reader.facts.header, heights=both) for both in (False, True)]
         assert found == [definition, crs if crs.startswith("EPSG") else definition]
-
-
-def test_more_keys_than_bytes_are_cut():
-    directory = bytearray(keys(short(1024, 1), short(3076, 9002)))
-    struct.pack_into("<H", directory, 6, 65535)
-    assert parse_geotiff(bytes(directory)[:-1]) == CrsUnits("projected")
 
 
 @given(st.binary(max_size=200), st.binary(max_size=64), st.binary(max_size=64))
@@ -241,16 +215,6 @@ def test_strips_that_are_not_in_metres_get_no_physics(tmp_path, records, message
     assert done.exit_code == 4
     assert message in done.stderr and "project the strip to metres" in done.stderr
     assert run_command(*arguments).exit_code == 0
-
-
-@pytest.mark.parametrize("scale", [1.0, 1 / 0.3048, 1e-5])
-def test_errors_along_the_ray_are_metres_in_any_unit(scale):
-    block = WaveformBlock.from_samples(np.zeros((1, 8), np.uint8))
-    block = replace(block, direction=block.direction * scale)
-    echoes = EchoTable.build(np.zeros(1), np.full(1, 4.0), np.ones(1), np.ones(1), time_err=np.full(1, 0.1))
-    noise = Noise(np.zeros(1, np.float32), np.ones(1, np.float32))
-    done = position(block, noise, SystemPulse(1.0), echoes)
-    assert done.attributes["range_err"][0] == pytest.approx(0.1 * HALF_C, rel=1e-3)
 
 
 def in_feet(source, target):
@@ -469,26 +433,6 @@ def test_an_extended_record_is_right_in_the_cloud_too(tmp_path):
         assert read_crs_definition(target, header) == repair_wkt(wkt)
 
 
-def test_las_1_3_has_no_wrong_wkt_beside_its_keys(tmp_path):
-    keys = Vlr(b"LASF_Projection", 34735, struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, 32633))
-    points, layout = _with_record(tmp_path / "a.las", (1, 3), 4, vlrs=[keys, build_wkt(RIPROCESS)])
-    _write(layout, tmp_path / "b.las", layout.rows(points))
-    header = read_header(tmp_path / "b.las")
-    assert header.version == (1, 3) and any("as RiPROCESS writes it" in note for note in layout.notes)
-    payloads = [vlr.payload for vlr in header.vlrs if is_projection(vlr)]
-    assert payloads == [keys.payload, repair_wkt(RIPROCESS).encode() + b"\0"]
-
-
-def test_so_do_synthetic_strips(strip, tmp_path):
-    words = ["synthesize", strip, "-o", tmp_path / "s.las"]
-    result = run_command(*words)
-    assert result.exit_code == 0, result.output
-    definition = read_crs_definition(tmp_path / "s.las", read_header(tmp_path / "s.las"))
-    assert definition == repair_wkt(RIPROCESS)
-    records = [vlr.payload for vlr in read_header(tmp_path / "s.las").vlrs if vlr.record_id == WKT_ID]
-    assert records == [repair_wkt(RIPROCESS).encode() + b"\0"]
-
-
 def test_so_do_rasters_and_voxels(strip, tmp_path):
     rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     for words in (["grid", strip, "--statistic", "count", "--size", 5, "-o", tmp_path / "x.tif"],
@@ -506,23 +450,6 @@ def geo_keys(**values):
     rows = [(int(key[1:]), 0, 1, value) for key, value in values.items()]
     flat = [number for row in [(1, 1, 0, len(rows)), *rows] for number in row]
     return [Vlr(b"LASF_Projection", 34735, struct.pack(f"<{len(flat)}H", *flat))]
-
-
-@pytest.mark.parametrize(
-    ("code", "name", "meridian", "northing", "datum"),
-    [
-        (32601, "WGS 84 / UTM zone 1N", -177, 0, "6326"),
-        (32760, "WGS 84 / UTM zone 60S", 177, 10000000, "6326"),
-        (25832, "ETRS89 / UTM zone 32N", 9, 0, "6258"),
-        (26910, "NAD83 / UTM zone 10N", -123, 0, "6269"),
-    ],
-)
-def test_utm_zones(code, name, meridian, northing, datum):
-    text = build_utm(code)
-    assert text.startswith(f'PROJCS["{name}"') and text.endswith(f'AUTHORITY["EPSG","{code}"]]')
-    assert f'"central_meridian",{meridian}]' in text and f'"false_northing",{northing}]' in text
-    assert f'AUTHORITY["EPSG","{datum}"]' in text and text.count("[") == text.count("]")
-    assert parse_wkt(text).is_metric and parse_wkt(text).kind == "projected"
 
 
 @pytest.mark.parametrize("code", [32600, 32661, 25827, 25839, 26924, 31468, 4326, 0])
@@ -547,11 +474,6 @@ def test_other_codes_are_not_guessed(code):
 )
 def test_only_sure_codes_are_found(values, code):
     assert find_code(geo_keys(**values)) == code
-
-
-def test_keys_of_any_bytes():
-    for payload in (b"", b"abc", bytes(7), b"\xff" * 64, struct.pack("<4H", 1, 1, 0, 9)):
-        assert find_code([Vlr(b"LASF_Projection", 34735, payload)]) is None
 
 
 def test_leicas_own_place_of_the_code():

@@ -12,7 +12,6 @@ from writer_tools import write_points
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader, ColumnReader, read_cloud
-from wavebatch.files.las.header import STANDARD_DTYPES
 
 
 def write_cloud(path, point_format, n=300, extra=()):
@@ -50,13 +49,6 @@ def test_clouds_of_every_format_without_waveforms_are_read(tmp_path, point_forma
     assert np.allclose(rows["xyz"], np.stack([cloud.x, cloud.y, cloud.z], axis=1), atol=1e-9)
     assert np.array_equal(rows["amplitude"], cloud.points.array["amplitude"])
     assert np.array_equal(rows["intensity"], cloud.points.array["intensity"])
-
-
-def test_the_piece_is_small_where_records_are_long(tmp_path):
-    path = tmp_path / "a.las"
-    write_cloud(path, 1)
-    with CloudReader(path) as reader:
-        assert max(map(len, reader.read_pieces(most=1000))) == 1000 // STANDARD_DTYPES[1].itemsize
 
 
 def test_extra_bytes_that_are_no_column_of_that_name_are_left_alone(tmp_path):
@@ -108,14 +100,6 @@ def test_no_reader_takes_several_numbers_for_a_column_that_the_account_names(tmp
     for name in ("amplitude", "echo_flags", "not_known"):
         with pytest.raises(ConfigError, match=f"has no column {name!r}"):
             ColumnReader(path, name)
-
-
-def test_flags_of_the_account_that_are_no_unsigned_integers_are_no_flags(tmp_path):
-    names = {"amplitude": "f4", "echo_flags": "f4"}
-    path = write_renamed(tmp_path / "a.las", names, {name: name for name in names})
-    with CloudReader(path) as cloud:
-        (rows,) = cloud.read_pieces()
-    assert set(cloud.written) == {"amplitude"} and (rows["amplitude"] == 2).all() and not rows["flags"].any()
 
 
 def _damage(rng, whole, points_at):

@@ -28,15 +28,6 @@ def test_laspy_reads_what_we_declare(dtype):
     assert bare.declared_range is None and not as_laspy(bare).min_is_relevant()
 
 
-@pytest.mark.parametrize("code", range(1, 31))
-def test_every_type_of_the_specification(code):
-    record = ExtraRecord(bytes([0, 0, code]) + bytes(189))
-    assert record.dtype == as_laspy(record).dtype()
-    length = (code - 1) // 10 + 1
-    no_data = record.with_no_data(np.arange(length) + 1).no_data
-    assert list(no_data) == list(range(1, length + 1))
-
-
 def test_texts_longer_than_the_record_are_refused():
     with pytest.raises(ValueError, match="32 bytes"):
         ExtraRecord.build("n" * 33, "f4", "")
@@ -55,16 +46,6 @@ def test_latin_1_texts_become_utf_8(stored, name):
     readable = record.with_readable_texts()
     assert as_laspy(readable).format_name() == readable.name == readable.description == name
     assert readable.with_readable_texts() == readable and len(readable.data) == 192
-
-
-@pytest.mark.parametrize("size", [*range(1, 80), 255, 256, 1000])
-def test_laspy_reads_records_of_undescribed_bytes(size):
-    """Their number stands where others have options: 8 to 31 would be a scale or an offset to laspy."""
-    records = read_records(b"", size)
-    assert sum(record.dtype.itemsize for record in records) == size
-    for record in records:
-        seen = as_laspy(record)
-        assert seen.num_elements() == record.dtype.itemsize and seen.scale is None and seen.offset is None
 
 
 def test_undescribed_bytes_get_records_of_their_own():
@@ -107,12 +88,3 @@ def test_vendors_amplitude_keeps_clear_of_values_that_wrapped():
     record = ExtraRecord.build("Amplitude", "u2", "", scale=0.01).with_range(np.array([0]), np.array([10000]))
     empty = int(choose_no_data(record)[0])
     assert 10000 + 20000 < empty < 65536 - 20000
-
-
-def test_no_data_without_any_evidence():
-    assert np.isnan(choose_no_data(ExtraRecord.build("a", "f4", ""))[0])
-    assert choose_no_data(ExtraRecord.build("a", "u2", "")) is None
-    assert choose_no_data(ExtraRecord.undocumented("a", 3)) is None
-    assert list(choose_no_data(ExtraRecord.build("a", "u2", "", no_data=5))) == [5]
-    vector = ExtraRecord(bytes([0, 0, 29]) + bytes(189))
-    assert np.isnan(choose_no_data(vector)).tolist() == [True] * 3

@@ -17,9 +17,9 @@ from commands import run_command
 from strips import descriptor, make_raw, read_all
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import read_header
-from wavebatch.files.strip.packet_check import packed_bytes, unpack_samples
+from wavebatch.files.strip.packet_check import packed_bytes
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.kernels.signal.signal import LEAST_LEVEL, find_fill, quiet_fill, recorded_lengths
@@ -89,14 +89,6 @@ def test_fill_is_what_a_waveform_steps_to_within_a_sample(text, runs):
             assert (quiet[expected] == np.sort(counts[~expected])[(~expected).sum() // 4]).all()
 
 
-def test_fill_is_found_wherever_it_lies():
-    for start in range(16, 60):
-        samples = np.full((3, 90), 12, np.uint8)
-        samples[1, start : start + 8] = 0
-        assert np.array_equal(find_fill(samples, 255), samples == 0)
-    assert find_fill(samples[:, :20], 255) is None and find_fill(samples[:0], 255) is None
-
-
 def test_clipped_echoes_and_waveforms_cut_at_a_threshold_are_no_fill():
     time = np.arange(120)
     for width in (1.5, 2.0, 4.0, 8.0):
@@ -111,18 +103,6 @@ def test_clipped_echoes_and_waveforms_cut_at_a_threshold_are_no_fill():
                     assert find_fill(cut, 255) is None
     assert find_fill(np.full((3, 60), 255, np.uint8), 255) is None
     assert find_fill(np.zeros((3, 60), np.uint8), 255) is None
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_distance_to_gaps_is_that_of_a_loop(seed):
-    rng = np.random.default_rng(seed)
-    missing = rng.random((30, 40)) < 0.1
-    missing[:5] = False
-    waveform, time = rng.integers(0, 30, 500), rng.uniform(-2, 42, 500)
-    for row, at, found in zip(waveform, time, gap_distance(missing, waveform, time), strict=True):
-        edges = np.flatnonzero(np.diff(np.r_[0, missing[row], 0]))
-        true = min((max(a - 1 - at, at - b) for a, b in zip(edges[::2], edges[1::2], strict=True)), default=np.inf)
-        assert found == pytest.approx(true)
 
 
 def cut(source, target, fill, shift=0):
@@ -306,11 +286,6 @@ def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     assert "with fill between recordings" in text
 
 
-def test_noise_without_gaps_has_one_level():
-    noise = Noise(np.arange(3, dtype=np.float32), np.ones(3, np.float32))
-    assert noise.of_sample is None and noise.level.shape == (3, 1) and noise.for_fits is noise.baseline
-
-
 @pytest.mark.parametrize(("number", "apart"), [(8, True), (9, False)])
 def test_waveforms_of_many_recordings_keep_one_level(number, apart):
     """Each recording is looked at in the length of the waveform: thousands of them would take all memory."""
@@ -371,17 +346,6 @@ def pack(samples, bits, little):
     order = np.arange(bits) if little else np.arange(bits)[::-1]
     stream = ((samples[:, :, None] >> order) & 1).astype(np.uint8).reshape(n, s * bits)
     return np.packbits(stream, axis=1, bitorder="little" if little else "big")
-
-
-@pytest.mark.parametrize("bits", [10, 12])
-@pytest.mark.parametrize("little", [False, True])
-@pytest.mark.parametrize("s", [1, 7, 32])
-def test_unpacked_samples_are_those_that_were_packed(rng, bits, little, s):
-    samples = rng.integers(0, 1 << bits, (20, s))
-    rows = pack(samples, bits, little)
-    assert rows.shape[1] == packed_bytes(s, bits)
-    found = unpack_samples(rows, s, bits, little)
-    assert found.dtype == np.uint16 and np.array_equal(found, samples)
 
 
 def smooth_counts(rng, n, s, bits):
@@ -469,11 +433,6 @@ def test_a_negative_gain_alone_means_inverted_unless_the_counts_go_up(upright, t
     with StripReader(changed) as reader, reader.scan() as scan:
         assert reader.facts.digitizers[1].gain == -1.0
         assert not scan.forms[1].inverted and "go up" in scan.notes[0]
-
-
-def test_noise_and_uniform_counts_are_not_inverted(tmp_path):
-    with StripReader(make_raw(200).write(tmp_path / "a.las")) as reader, reader.scan() as scan:
-        assert not scan.forms
 
 
 def test_shuffled_points_give_the_same_sample_and_survey(upright, tmp_path, edit_points):

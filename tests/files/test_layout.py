@@ -1,17 +1,15 @@
 """Output rows: the input's fields, our columns, and nothing else."""
 
-import pickle
 
 import laspy
 import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
-from writer_tools import data_file, facts_of, plan_output, random_points, read_raw, write_source, write_strip
+from writer_tools import facts_of, plan_output, random_points, write_source, write_strip
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.las.header import STANDARD_DTYPES, ExtraRecord, Vlr
 
-RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 VERSIONS = {4: (1, 3), 5: (1, 3), 9: (1, 4), 10: (1, 4)}
 GEOTIFF = Vlr(b"LASF_Projection", 34735, bytes(8))
 WKT = Vlr(b"LASF_Projection", 2112, b"PROJCRS\0")
@@ -26,19 +24,6 @@ def fields_of(rows, point_format):
 def plain(rows, point_format):
     """The standard part of rows, as an array of the bare point format."""
     return repack_fields(rows[list(STANDARD_DTYPES[point_format].names)])
-
-
-@pytest.mark.parametrize(("point_format", "family"), [(4, 1), (5, 3), (9, 6), (10, 8)])
-def test_the_family_is_kept_with_every_field(tmp_path, point_format, family):
-    points = write_source(tmp_path / "a.las", point_format, VERSIONS[point_format])
-    layout = plan_output(tmp_path / "a.las", [], las_version="keep")
-    assert (layout.point_format, layout.version) == (family, VERSIONS[point_format])
-    assert layout.notes == ()
-    rows = layout.rows(points)
-    before, after = fields_of(points, point_format), fields_of(rows, family)
-    assert not set(after) - set(before)
-    for name, values in after.items():
-        np.testing.assert_array_equal(values, before[name], name)
 
 
 @pytest.mark.parametrize(
@@ -113,28 +98,6 @@ def test_coordinates_are_rounded_kept_or_refused(tmp_path):
             layout.rows(points, xyz=bad)
 
 
-@pytest.mark.parametrize(("point_format", "limit"), [(4, 7), (9, 15)])
-def test_return_numbers_are_cut_to_what_the_format_holds(tmp_path, point_format, limit):
-    points = write_source(tmp_path / "a.las", point_format, VERSIONS[point_format], n=20)
-    layout = plan_output(tmp_path / "a.las", [], las_version="keep")
-    assert layout.max_return == limit
-    rows = layout.rows(points, return_number=np.arange(1, 21), number_of_returns=np.full(20, 20))
-    after, before = (fields_of(r, f) for r, f in ((rows, layout.point_format), (points, point_format)))
-    np.testing.assert_array_equal(after["return_number"], np.minimum(np.arange(1, 21), limit))
-    np.testing.assert_array_equal(after["number_of_returns"], np.full(20, limit))
-    for name in ("scan_direction_flag", "edge_of_flight_line", "classification"):
-        np.testing.assert_array_equal(after[name], before[name])
-
-
-def test_columns_and_no_data(tmp_path):
-    points = write_source(tmp_path / "a.las", 9, (1, 4), n=3)
-    layout = plan_output(tmp_path / "a.las", ["amplitude", "x", "echo_width", "echo_flags"])
-    rows = layout.rows(points, columns={"amplitude": np.array([1.5, np.nan, 3]), "unknown": None})
-    assert layout.extra_fields == ("amplitude", "echo_width", "echo_flags")
-    assert rows["amplitude"].tolist() == [1.5, -9999.0, 3.0]
-    assert rows["echo_width"].tolist() == [-9999.0] * 3 and rows["echo_flags"].tolist() == [0] * 3
-
-
 SEVERAL = [
     ExtraRecord.build("Amplitude", "u2", "dB", scale=0.01).with_range(np.array([0]), np.array([10000])),
     ExtraRecord.build("real", "f8", ""),
@@ -184,17 +147,6 @@ def test_carried_names_are_told_apart(tmp_path, name):
     assert names[0] == (name.decode() if name in (b"same", b"x" * 32) else f"{begin} 2") and names[1].startswith(begin)
 
 
-def test_returns_keep_all_extra_bytes_exactly(tmp_path):
-    points = write_several(tmp_path / "a.las")
-    layout = plan_output(tmp_path / "a.las", ["amplitude"], points="returns")
-    assert layout.copied == () and layout.written[0].record.name == "wb_amplitude"
-    assert layout.extra_fields == (*points.dtype.names[-6:], "wb_amplitude")
-    rows = layout.rows(points, matched=np.zeros(6, bool))
-    for name in points.dtype.names[-6:]:
-        assert rows[name].tobytes() == points[name].tobytes(), name
-    assert [(r.name, r.code) for r in layout.extra_records[:-1]] == [(r.name, r.code) for r in SEVERAL]
-
-
 def test_echoes_carry_every_extra_byte_and_mark_added_rows_where_a_value_is_free(tmp_path):
     points = write_several(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", ["amplitude"])
@@ -219,44 +171,6 @@ def test_strict_refuses_what_cannot_be_marked(tmp_path):
     assert plan_output(tmp_path / "a.las", ["amplitude"], strict=True, points="returns").copied == ()
 
 
-def test_our_own_output_can_be_an_input(tmp_path):
-    write_source(tmp_path / "a.las", 6, (1, 4), records=[ExtraRecord.build("amplitude", "f4", "[DN]", no_data=-9999)])
-    layout = plan_output(tmp_path / "a.las", ["amplitude"])
-    assert layout.extra_fields == ("amplitude", "wb_amplitude")
-
-
-def test_a_layout_survives_pickling_and_does_not_depend_on_blocks(tmp_path):
-    points = write_several(tmp_path / "a.las")
-    layout = plan_output(tmp_path / "a.las", ["amplitude", "echo_flags"])
-    copy = pickle.loads(pickle.dumps(layout))
-    rng = np.random.default_rng(3)
-    columns, xyz = {"amplitude": rng.normal(size=6)}, rng.normal(1000, 5, (6, 3))
-    matched = rng.random(6) < 0.5
-    whole = layout.rows(points, xyz=xyz, columns=columns, matched=matched)
-    for size in (1, 2, 4):
-        parts = [
-            copy.rows(
-                points[at : at + size],
-                xyz=xyz[at : at + size],
-                columns={"amplitude": columns["amplitude"][at : at + size]},
-                matched=matched[at : at + size],
-            )
-            for at in range(0, 6, size)
-        ]
-        assert np.concatenate(parts).tobytes() == whole.tobytes()
-
-
-def test_input_records_are_never_written_to(tmp_path):
-    points = write_several(tmp_path / "a.las")
-    before = points.tobytes()
-    points.flags.writeable = False
-    layout = plan_output(tmp_path / "a.las", ["amplitude"])
-    layout.rows(points, xyz=np.full((6, 3), 1000.0), return_number=np.ones(6), matched=np.zeros(6, bool))
-    layout.rows(points[::2])
-    assert points.tobytes() == before
-    assert len(layout.rows(points[:0], xyz=np.empty((0, 3)))) == 0
-
-
 def test_kept_packets_keep_pointers_and_take_new_locations(tmp_path):
     points = write_strip(tmp_path / "a.las", n=4)
     layout = plan_output(tmp_path / "a.las", ["echo_time"], packets=facts_of(tmp_path / "a.las"))
@@ -270,19 +184,6 @@ def test_kept_packets_keep_pointers_and_take_new_locations(tmp_path):
         np.testing.assert_array_equal(rows[name], points[name])
     kept = layout.rows(points, columns={"echo_time": time})  # no new positions: locations stay too
     np.testing.assert_array_equal(kept["return_point_wave_location"], location)
-
-
-def test_real_vendor_file(tmp_path):
-    path = data_file(RIEGL)
-    points = read_raw(path)
-    layout = plan_output(path, ["amplitude", "echo_width"], names="riegl")
-    assert [column.record.name for column in layout.written] == ["wb_amplitude", "wb_Pulse_width"]
-    assert layout.copied == () and layout.extra_fields[:2] == ("Amplitude", "Pulse width")
-    for record, name in zip(layout.extra_records, ("Amplitude", "Pulse width"), strict=False):
-        assert int(record.no_data[0]) not in points[name]
-    rows = layout.rows(points)
-    for name in rows.dtype.names[:-2]:
-        np.testing.assert_array_equal(rows[name], points[name])
 
 
 def test_records_that_leave_no_room_are_refused(tmp_path):

@@ -17,7 +17,6 @@ from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_
 from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.strip import packets
 from wavebatch.files.strip.packet_check import DirectionTally, decide_direction, is_strange
 from wavebatch.files.strip.packets import PacketFile, PacketPlace
 from wavebatch.files.strip.reader import StripReader
@@ -243,11 +242,6 @@ def _bytes_read():
     """By this process so far, with those of this function."""
     with open("/proc/self/io") as file:
         return next(int(line.split()[1]) for line in file if line.startswith("rchar"))
-
-
-def test_a_block_of_huge_waveforms_is_kept_small():
-    assert packets.block_rows(4096, 65_536, 32) * 65_536 * 4 <= packets.BLOCK_BYTES
-    assert packets.block_rows(4096, 100, 8) == 4096
 
 
 SCENES = {"forest": (), "urban": (), "slope": (), "canopy.gemini-24": (), "empty": ("--noise", "15")}

@@ -18,7 +18,7 @@ import lazrs
 import numpy as np
 import pytest
 from numpy.lib import recfunctions
-from strips import make_raw, read_all, vlr
+from strips import make_raw
 from writer_tools import BACKENDS, data_file, read_raw
 
 from wavebatch.core.errors import InputError
@@ -190,13 +190,6 @@ def test_a_chunk_that_does_not_fit_memory_is_refused(tmp_path):
     refused(path, "chunks are too large|table of LAZ chunks")
 
 
-def test_other_vlrs_do_not_confuse(tmp_path):
-    raw = make_raw(60)
-    raw.vlrs.append(vlr(b"other", 22204, b"x" * 10))
-    path = raw.write(tmp_path / "a.laz")
-    assert read(path, (0, 5))[0].tobytes() == raw.points[:5].tobytes()
-
-
 RECORDS = [ExtraRecord.build("width", "<f4", "a test", no_data=-9999.0)]
 
 
@@ -287,31 +280,6 @@ def test_chunks_of_one_scanner_channel_each_are_written_and_others_refused(tmp_p
         assert read_raw(tmp_path / "a.laz", backend).tobytes() == rows.tobytes()
     with pytest.raises(InputError, match="several scanner channels"):
         compress_rows(rows[-200:], 9)
-
-
-def test_statistics_do_not_depend_on_how_rows_are_cut():
-    """Also where 0.0 and -0.0 are the extremes: which one a minimum returns depends on the order of the rows."""
-    rows = make_rows(6, 1000)
-    width = rows.dtype.names[-1]
-    rows[width] = np.where(np.arange(1000) % 3, 0.0, -0.0)
-    rows["gps_time"] = -0.0
-    rows["gps_time"][500:] = 0.0
-    seen = set()
-    for pieces in 1, 2, 3, 10:
-        whole = Statistics(rows.dtype, RECORDS)
-        for part in np.array_split(rows, pieces):
-            whole.add(part)
-        joined = Statistics(rows.dtype, RECORDS)
-        for part in np.array_split(rows, pieces):
-            other = Statistics(rows.dtype, RECORDS)
-            other.add(part)
-            joined.join(pickle.loads(pickle.dumps(other)))
-        assert joined.ranged()[0].data == whole.ranged()[0].data and joined.count == whole.count
-        header = LasHeader.new((1, 5), 6, (0.01,) * 3, (0.0,) * 3)
-        whole.fill(header)
-        seen.add((header.point_count, header.by_return, header.mins, header.maxs, str(header.gps_range),
-                  whole.ranged()[0].data))  # fmt: skip
-    assert len(seen) == 1
 
 
 def test_rows_of_another_layout_are_refused(tmp_path):
@@ -423,12 +391,6 @@ def test_a_front_that_does_not_fit_memory(tmp_path):
     path = patch(make_raw().write(tmp_path / "a.las"), 96, struct.pack("<I", 1 << 27))
     os.truncate(path, 1 << 28)  # a hole, which takes no room on the disk
     refused(path, r"header with 1 VLRs in .* bytes \(at most")
-
-
-def test_user_ids_and_descriptions_that_are_no_text(tmp_path):
-    raw = make_raw()
-    raw.vlrs.append(vlr(b"\xff\xfe\x00\x80", 5, b"\xff" * 30, reserved=0xAABB))
-    assert len(read_all(raw.write(tmp_path / "a.las"))) == 40
 
 
 def test_unexplained_extra_bytes_are_kept(tmp_path):

@@ -1,11 +1,10 @@
 """Units, packets, blocks: what StripReader gives against a plain reading of the same bytes."""
 
 import os
-import pickle
 
 import numpy as np
 import pytest
-from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, vlr
+from strips import descriptor, make_raw, read_all, read_plainly
 from writer_tools import data_file, read_raw
 
 from wavebatch.core.echoes import EchoFlag
@@ -47,15 +46,6 @@ def test_every_kind_of_strip_gives_the_samples_in_its_bytes(tmp_path, point_form
     raw = make_raw(point_format=point_format, minor=minor, internal=internal, bits=bits)
     path = raw.write(tmp_path / f"a{suffix}")
     assert_same(read_all(path), read_plainly(raw.points, bytes(60) + raw.packets, {1: (bits, 32)}))
-
-
-def test_geometry_is_that_of_the_simulated_pulses(tmp_path):
-    raw = make_raw()
-    found = read_all(raw.write(tmp_path / "a.las"))
-    for _, members, origin, direction in found.values():
-        pulse = round((raw.points["gps_time"][members[0]] - 1000.0) * 1e5)
-        np.testing.assert_allclose(origin, [pulse * 0.5, 0, 500], atol=2e-3)
-        np.testing.assert_allclose(direction, -1000 * TOWARD, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "packets"), [(RIEGL, 2375), (LEICA, 999)])
@@ -114,19 +104,6 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, orde
     assert not spooled.exists()
 
 
-def test_block_and_unit_sizes_change_nothing():
-    path = data_file(RIEGL)
-    whole = read_all(path, size=4096)
-    for size in (1, 13):
-        parts = read_all(path, size=size, unit_points=77)
-        assert list(parts.keys() - whole.keys()) == []
-        for key, (samples, members, origin, direction) in whole.items():
-            np.testing.assert_array_equal(parts[key][0], samples)
-            assert parts[key][1] == members
-            assert parts[key][2].tobytes() == origin.tobytes()
-            assert parts[key][3].tobytes() == direction.tobytes()
-
-
 def test_units_take_every_point_once_and_cut_no_pulse(tmp_path):
     raw = make_raw(400)
     with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
@@ -156,26 +133,6 @@ def test_a_run_of_63_points_may_be_a_pulse(tmp_path, length, border):
         assert scan.borders.tolist() == [0, border, 100]
 
 
-def test_context_gives_returns_of_other_units(tmp_path):
-    raw = make_raw(64, most_returns=1)
-    points = np.concatenate([raw.points, raw.points])
-    points["gps_time"] = np.arange(128)
-    points["bit_fields"][64:] = 2
-    points["return_point_wave_location"][64:] += 8000
-    raw.points = points
-    with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
-        first, second = reader.read_unit(0, scan), reader.read_unit(1, scan)
-        assert first.context_index.tolist() == list(range(64, 128))
-        assert second.context_index.tolist() == list(range(64))
-        assert first.packets.owned.all() and not second.packets.owned.any()
-        assert list(reader.read_blocks(second, 100, owned_only=True)) == []
-        (block, rows), = reader.read_blocks(second, 100, owned_only=False)
-        assert block.point.tolist() == list(range(64))
-        assert block.returns.point.reshape(64, 2).tolist() == [[i, i + 64] for i in range(64)]
-        assert second.packet_of_point.tolist() == rows.tolist()
-        assert block.gps_time.tolist() == list(range(64))
-
-
 def test_unusable_packets_are_flagged_and_the_rest_is_read(tmp_path):
     raw = make_raw(40, most_returns=1)
     p = raw.points
@@ -202,13 +159,6 @@ def test_unusable_packets_are_flagged_and_the_rest_is_read(tmp_path):
         assert sum(count for count, _ in scan.reasons.values()) == 9
         assert len(scan.warnings) == 5
         assert [len(block) for block, _ in reader.read_blocks(unit, 100, True)] == [29]
-
-
-def test_the_last_byte_of_the_last_packet_counts(tmp_path):
-    raw = make_raw(4, most_returns=1)
-    raw.packets = raw.packets[:-1]
-    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
-        assert reader.read_unit(0, scan).point_flags.tolist() == [0, 0, 0, EchoFlag.BROKEN_PACKET]
 
 
 def test_packets_shorter_than_the_descriptor_come_by_length(tmp_path):
@@ -291,29 +241,6 @@ def test_offsets_beyond_4_gib(tmp_path):
     assert any(offset < 2**32 for _, offset in found)
 
 
-def test_samples_are_read_only_and_blocks_hold_at_most_their_size(tmp_path):
-    with StripReader(make_raw(100).write(tmp_path / "a.las")) as reader, reader.scan() as scan:
-        unit = reader.read_unit(0, scan)
-        sizes = []
-        for block, rows in reader.read_blocks(unit, 33, True):
-            assert not block.samples.flags.writeable
-            assert block.samples.flags.c_contiguous
-            assert len(rows) == len(block)
-            sizes.append(len(block))
-        assert sizes == [33, 33, 33, 1]
-
-
-def test_sample_blocks_spread_over_the_strip_and_repeat(tmp_path):
-    with StripReader(make_raw(1000).write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
-        points = [block.point for block in reader.sample_blocks(scan, 100)]
-        again = [block.point for block in reader.sample_blocks(scan, 100)]
-        everything = np.concatenate(points)
-        assert everything.tolist() == np.concatenate(again).tolist()
-        assert 90 <= len(everything) <= 110
-        assert everything.min() < 100 and everything.max() > scan.points - 150
-        assert sum(len(block) for block in reader.sample_blocks(scan, 10**6)) <= scan.packets
-
-
 def test_a_strip_without_points_and_one_without_waveforms(tmp_path):
     raw = make_raw(5)
     raw.points = raw.points[:0]
@@ -327,16 +254,6 @@ def test_a_strip_without_points_and_one_without_waveforms(tmp_path):
         assert (unit.point_flags == EchoFlag.NO_WAVEFORM).all()
         assert len(unit.packets) == 0
         assert list(reader.read_blocks(unit, 10, True)) == []
-
-
-def test_facts_scans_and_units_travel_between_processes(tmp_path):
-    raw = make_raw(64, most_returns=1)
-    raw.points = np.concatenate([raw.points, raw.points])
-    with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
-        facts, copy = pickle.loads(pickle.dumps((reader.facts, scan)))
-        assert facts.digitizers == reader.facts.digitizers
-        here, there = reader.read_unit(1, scan), reader.read_unit(1, copy)
-        assert here.context_index.tolist() == there.context_index.tolist() != []
 
 
 @pytest.mark.parametrize("case", ["kept", "beyond the limit", "no room"])
@@ -356,23 +273,6 @@ def test_compressed_points_are_decoded_once(tmp_path, request, case):
             assert len({unit.points.tobytes() for unit in units}) == 1
     count = scan.decoded.count
     assert {"kept": count == 200, "no room": count == 0}.get(case, 0 < count < 200)
-
-
-def test_extra_bytes_and_crs_are_told(tmp_path):
-    raw = make_raw(5)
-    wide = np.zeros(len(raw.points), [*raw.points.dtype.descr, ("tail", "<u2")])
-    for name in raw.points.dtype.names:
-        wide[name] = raw.points[name]
-    wide["tail"] = np.arange(len(wide))
-    raw.points = wide
-    record = bytearray(192)
-    record[2] = 3
-    record[4:8] = b"tail"
-    raw.vlrs += [vlr(b"LASF_Spec", 4, bytes(record)), vlr(b"LASF_Projection", 2112, b"PROJCS[\"x\"]\0")]
-    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
-        assert [record.name for record in reader.facts.records] == ["tail"]
-        assert reader.facts.crs == 'PROJCS["x"]'
-        assert reader.read_unit(0, scan).points["tail"].tolist() == list(range(len(wide)))
 
 
 def test_long_records_make_smaller_units(tmp_path):

@@ -33,23 +33,6 @@ def test_buckets_give_every_row_back_in_order_and_pulses_whole(rng, number):
     assert sum(map(len, times)) == len(set.union(*times))
 
 
-def test_times_that_are_equal_have_equal_keys():
-    keys = temp_store.time_keys(np.array([0.0, -0.0, 1.5, 1.5]))
-    assert keys[0] == keys[1] and keys[2] == keys[3] and keys[0] != keys[2]
-
-
-def test_keys_spread_evenly_even_if_they_are_regular():
-    regular = temp_store.time_keys(np.arange(72_000) * 1e-5).astype(np.int64)
-    for keys in (np.arange(72_000), np.arange(72_000) << 12, regular):
-        count = np.bincount(temp_store.spread_keys(keys.astype(np.uint64), 72), minlength=72)
-        assert count.min() > 700 and count.max() < 1300
-
-
-def test_number_of_buckets():
-    numbers = [temp_store.count_buckets(rows, 100) for rows in (0, 1, 100, 101, 10**9)]
-    assert numbers == [1, 1, 1, 2, temp_store.MOST_BUCKETS]
-
-
 def slow_sums(parts):
     sums = {}
     for key, value in parts:
@@ -90,15 +73,6 @@ def test_pieces_of_many_runs_are_small():
         runs = len(sums._runs)
         sizes = [len(key) for key, _ in sums.pieces()]
     assert runs > 50 and sum(sizes) > 30_000 and max(sizes) <= 400 + 8 * runs and min(sizes) > 0
-
-
-def test_pieces_can_be_read_twice_and_may_be_none():
-    with temp_store.KeyedSums(2, held=1000) as sums:
-        assert list(sums.pieces()) == []
-        for key, value in draw_parts(3, 100_000, 300):
-            sums.add(key, value[:, :2])
-        first, second = ([key.tolist() for key, _ in sums.pieces()] for _ in range(2))
-    assert first == second and len(first) > 1
 
 
 def test_without_a_place_sums_say_so(no_place):

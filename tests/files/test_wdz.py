@@ -65,13 +65,6 @@ def test_damaged_packets_are_flagged_and_the_others_read(packed, rng):
     assert np.count_nonzero(flags & int(EchoFlag.BROKEN_PACKET)) == scan.broken
 
 
-def test_a_cut_wdz_keeps_what_is_there(packed):
-    wdz = packed.with_suffix(".wdz")
-    wdz.write_bytes(wdz.read_bytes()[:-2000])
-    found, scan = _read(packed)
-    assert 0 < scan.broken < 200 and len(found) > 2000
-
-
 def test_a_run_of_both_gives_the_same_points(plain, packed, tmp_path):
     clouds = []
     for path in (plain, packed):

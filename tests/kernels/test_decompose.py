@@ -174,7 +174,7 @@ def draw_crowd(rng):
 )
 @pytest.mark.parametrize(("known", "whitening"), [(0.0, ()), (3.0, ()), (3.0, (1.1, -0.4))])
 def test_clusters_grow_as_those_of_the_twin(shape, draw, clip, known, whitening):
-    rng, m = np.random.default_rng(5), 20 if draw is draw_crowd else 50  # its twin takes long
+    rng, m = np.random.default_rng(5), 20 if draw is draw_crowd else 30  # the twin takes long
     truth = [draw(rng) for _ in range(m)]
     y = np.stack([naive_fit.naive.model(p, np.arange(float(LENGTH)), components=shape.components) for p in truth])
     noise = rng.standard_normal(y.shape)

@@ -6,13 +6,10 @@ import naive
 import naive_fit
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from wavebatch.kernels.elementary import exp, log, log1p, solve
 from wavebatch.kernels.fit import pulse_shape
-from wavebatch.kernels.fit.closed_form import estimate_starts, fit_parabola, start_errors
-from wavebatch.kernels.fit.decompose import Solution, choose
-from wavebatch.kernels.fit.learn_pulse import Stack, fit_bounded, refine_gaussians, stack_pulse
+from wavebatch.kernels.fit.learn_pulse import Stack, refine_gaussians
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 
@@ -36,54 +33,6 @@ def test_equations_are_solved_as_by_numpy(rng, size):
         np.testing.assert_allclose(solve(matrix, wanted), np.linalg.solve(matrix, wanted), rtol=1e-5)
 
 
-def test_parabolas_are_those_of_numpy(rng):
-    x, y, weight = rng.normal(0, 2, (7, 40)), rng.normal(0, 5, (7, 40)), rng.uniform(0.1, 3, (7, 40))
-    found = np.stack(fit_parabola(weight, x, y, axis=0))
-    for column in range(40):
-        expected = np.polyfit(x[:, column], y[:, column], 2, w=np.sqrt(weight[:, column]))[::-1]
-        assert found[:, column] == pytest.approx(expected, rel=1e-6)
-    assert not np.any(fit_parabola(np.ones(7), np.zeros(7), y[:, 0], axis=0)), "all in one place"
-
-
-def test_starts_are_those_of_single_peaks(rng):
-    """Peaks, samples that are none, and those at both ends."""
-    z = (np.arange(30)[:, None] - rng.uniform(0, 29, 20)) / 2.5
-    smoothed = rng.normal(3, 2, (30, 20)) + 60 * np.exp(-0.5 * z**2)
-    waveform = np.arange(20).repeat(2)
-    sample = np.stack([smoothed.argmax(axis=0), rng.integers(0, 30, 20)], axis=1).ravel()
-    keep = smoothed[sample, waveform] > 1
-    waveform, sample = waveform[keep], sample[keep]
-    found = estimate_starts(smoothed.astype(np.float32), waveform, sample, 2.0)
-    for row, (w, at) in enumerate(zip(waveform, sample, strict=True)):
-        assert [part[row] for part in found] == pytest.approx(naive.log_parabola(smoothed[:, w], at, 2.0), rel=1e-3)
-
-
-def test_errors_of_starts_are_those_of_each_sample():
-    amplitude, width = np.array([20.0, 300.0, 300.0, 50.0]), np.array([0.9, 1.5, 3.0, 6.0])
-    std = np.array([1, 2, 0.5, 1])
-    found = start_errors(amplitude, width, std)
-    for row in range(4):
-        expected = naive_fit.start_errors(amplitude[row], width[row], std[row])
-        assert (found[0][row], found[1][row]) == pytest.approx(expected, rel=0.02)
-
-
-def test_moments_of_residuals_are_those_of_the_twin(rng):
-    """Also of echoes at the ends of the waveform, and narrower or wider than it."""
-    s = 60
-    residual = rng.normal(0, 2, (30, s)).astype(np.float32)
-    time, width = rng.uniform(-2, s + 2, 30), rng.uniform(0.6, 5, 30)
-    width[:2] = 40.0
-
-    def read(rows, at):
-        return np.take_along_axis(residual[rows], at, axis=1)
-
-    h3, h4 = pulse_shape.residual_moments(read, s, time, width, np.full(30, 2.0))
-    x = np.arange(float(s))
-    for row in range(30):
-        expected = naive_fit.moments(np.array([[1.0], [time[row]], [width[row]]]), x, residual[row].astype(float), 2.0)
-        assert (h3[row], h4[row]) == pytest.approx((expected[0][0], expected[1][0]), abs=0.02)
-
-
 @pytest.mark.parametrize("s", [40, 1300])
 @pytest.mark.parametrize(
     "shape", [{}, {"kappa": 0.2}, {"components": ((0.3, 4.0, 2.0), (-0.1, 9.0, 0.5))}], ids=["gauss", "skewed", "sum"]
@@ -99,34 +48,6 @@ def test_rendered_waveforms_are_sums_of_pulses(rng, shape, s):
         own = waveform == row
         expected = naive.model(np.stack([amplitude, time, width])[:, own], x, **shape) if own.any() else np.zeros(s)
         np.testing.assert_allclose(found[row], expected, atol=0.02)
-
-
-def test_a_stacked_pulse_is_the_median_of_single_samples(rng):
-    time, amplitude = rng.uniform(10, 20, 90), rng.uniform(50, 200, 90)
-    signal = amplitude[:, None] * np.exp(-0.5 * ((np.arange(32) - time[:, None]) / 2) ** 2) + rng.normal(0, 1, (90, 32))
-    signal[5, 3:9], signal[7] = np.nan, np.inf
-    found = stack_pulse(signal, amplitude, time, 8.0, 12.0)
-    step = found.lag[1] - found.lag[0]
-    expected = naive_fit.stack(signal, amplitude, time, 8.0, 12.0, step)
-    assert found.lag == pytest.approx([lag for lag, *_ in expected])
-    assert found.value == pytest.approx([middle for _, middle, *_ in expected], abs=1e-5)
-    scatter = [np.std(values) / np.sqrt(number) for *_, number, values in expected]
-    assert np.median(found.error / scatter) == pytest.approx(1.25, rel=0.15)
-
-
-@pytest.mark.parametrize("bounded", [False, True])
-def test_bounded_fits_are_those_of_scipy(rng, bounded):
-    x = np.linspace(-6, 9, 80)
-    y = 1.3 * np.exp(-0.5 * ((x - 0.4) / 1.7) ** 2) + 0.02 * rng.standard_normal(80)
-    low, high = np.array([0.0, -3.0, 0.3]), np.array([1.1 if bounded else 9.0, 3.0, 5.0])
-
-    def misfit(p):
-        return p[0] * np.exp(-0.5 * ((x - p[1]) / p[2]) ** 2) - y
-
-    start = np.array([1.0, 0.0, 1.0])
-    found = fit_bounded(misfit, lambda p: naive.differentiate(misfit, p), start, low, high, 200)
-    expected = least_squares(misfit, start, bounds=(low, high), xtol=1e-12, ftol=1e-12).x
-    assert found == pytest.approx(expected, abs=1e-4) and (found[0] == 1.1) == bounded
 
 
 @pytest.mark.parametrize("components", [1, 2, 3, 4])
@@ -149,55 +70,12 @@ def test_sums_of_gaussians_are_fitted_as_by_the_twin(rng, components, hard):
         assert (found.components[:, 0] * weight).min() == pytest.approx(-0.3, abs=1e-6), "it is held at its bound"
 
 
-def test_chosen_solutions_are_those_of_a_loop(rng):
-    solutions = []
-    for _ in range(3):
-        number = rng.integers(0, 4, 12)
-        m = number.sum()
-        per_cluster = rng.random(12) < 0.5, rng.random(12)
-        per_echo = rng.random(m), *rng.random((2, m, 4)), rng.random((m, 2)), rng.random(m) < 0.5
-        solutions.append(Solution(number, *per_cluster, *per_echo))
-    chosen = rng.integers(0, 3, 12)
-    found = choose(solutions, chosen)
-    for name in Solution._fields:
-        per_echo = name in ("misfit", "parameters", "errors", "shared", "at_bound")
-        rows = []
-        for cluster, which in enumerate(chosen):
-            values = getattr(solutions[which], name)
-            rows += list(values[solutions[which].cluster == cluster]) if per_echo else [values[cluster]]
-        np.testing.assert_array_equal(getattr(found, name), np.array(rows), name)
-
-
-def test_tails_are_those_of_a_loop(rng):
-    first, values = -3.0, rng.normal(0, 0.1, 60)
-    tail = pulse_shape.PulseTail(first, values)
-    lag = rng.uniform(-6, 16, 200)
-    places = first + pulse_shape.TAIL_STEP * np.arange(60)
-    expected = [values[np.argmin(np.abs(places - at))] if -3.1 < at < 11.8 else 0.0 for at in lag]
-    inside = (np.abs(lag + 3.125) > 0.03) & (np.abs(lag - 11.875) > 0.2)
-    assert pulse_shape.tail_at(tail, lag)[inside] == pytest.approx(np.array(expected)[inside])
-    ratio = np.r_[0.0, 1.0, 5.0, rng.uniform(1, 200, 30)]
-    expected = [naive_fit.tail_reach(first, values, pulse_shape.TAIL_STEP, one) for one in ratio]
-    assert pulse_shape.tail_reach(tail, ratio).tolist() == expected
-
-
 @pytest.mark.parametrize("shape", [{}, {"components": ((0.2, 2.5, 1.0),)}])
 def test_measures_of_pulses_are_those_of_roots(shape):
     found = pulse_shape.measure_pulse(pulse_shape.PulseShape(**shape), 1.2, 4.0)
     for row in (0, 90, 199):
         expected = naive_fit.measure(shape, found.width[row])
         assert (found.peak[row], found.half_width[row]) == pytest.approx(expected, rel=1e-5)
-
-
-def test_the_one_gaussian_of_a_pulse_is_that_of_scipy():
-    x = np.linspace(-8, 14, 300)
-    value = naive.pulse(x, 1.3, 1.7, kappa=0.2)
-
-    def misfit(p):
-        return p[0] * naive.pulse(x, p[1], p[2]) - value
-
-    expected = least_squares(misfit, [1.0, 1.0, 1.5], xtol=1e-12, ftol=1e-12).x
-    assert pulse_shape.fit_one_gaussian(x, value) == pytest.approx(expected[1:], abs=1e-4)
 
 
 @pytest.mark.parametrize("spread", [0.0, 3.0])

@@ -5,19 +5,9 @@ import numpy as np
 
 from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.group_returns import (
-    LONGEST_PULSE,
     find_rays,
-    group_times,
 )
 from wavebatch.kernels.geometry.normals import thin_out
-from wavebatch.kernels.physics.radiometry import known_distance, slope_error
-
-
-def test_packets_of_equal_time_are_those_of_a_loop(rng):
-    time = np.concatenate([rng.integers(0, 40, 120).astype(float), np.full(LONGEST_PULSE, 77.0), [np.nan] * 3])
-    rng.shuffle(time)
-    assert group_times(time).tolist() == naive_geometry.group_times(time)
-    assert group_times(time[:0]).tolist() == []
 
 
 def test_packets_of_a_pulse_lie_on_one_line(rng):
@@ -43,13 +33,3 @@ def test_dense_points_are_thinned_as_by_a_loop(rng):
     expected = naive_geometry.thin_out(xyz, row, 2.0, normals.FINENESS, normals.MOST_PER_CELL)
     np.testing.assert_array_equal(kept, expected)
     assert 0.1 < kept.mean() < 0.9
-
-
-def test_surfaces_struck_from_behind_have_large_errors():
-    grazed = slope_error(np.array([1.2]), 0.6)
-    assert np.isfinite(grazed) and grazed > 5, "some of these surfaces are struck from behind"
-
-
-def test_distances_that_cannot_be_are_not_known():
-    known = known_distance(np.array([1.0, 0.0, -3.0, np.nan, np.inf, 1e5], np.float32))
-    assert known.dtype == np.float64 and np.isnan(known[1:5]).all() and known[[0, 5]].tolist() == [1.0, 1e5]

@@ -6,25 +6,9 @@ import naive_physics
 import numpy as np
 import pytest
 
-from wavebatch.kernels.physics import incidence, radiometry
+from wavebatch.kernels.physics import incidence
 from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
 from wavebatch.kernels.physics.radiometry import judge_energies
-
-BETA = 5e-4
-
-
-@pytest.mark.parametrize("slope", [0.02, 0.2, 0.6])
-@pytest.mark.parametrize("angle", [0.0, 0.1, 0.5])
-def test_the_error_of_an_unknown_slope_is_that_over_its_directions(slope, angle):
-    expected = naive_physics.slope_error(angle, slope)
-    assert radiometry.slope_error(np.array([angle]), slope) == pytest.approx(expected, rel=1e-5)
-
-
-def test_air_between_known_wavelengths_scatters_as_haze():
-    """The ratio to 1064 nm is that of the power law, whose exponent is 1.3 for usual visibility."""
-    for wavelength in (532.0, 905.0, 1064.0, 1550.0):
-        expected = radiometry.AIR_ATTENUATION * (wavelength / 1064.0) ** -1.3
-        assert radiometry.usual_attenuation(wavelength) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("threshold", [2.0, 4.0])

@@ -18,7 +18,6 @@ from wavebatch.kernels.geometry.planes import (
     chance_of_ratio,
     compare_halves,
     fit_planes,
-    is_flat,
     measure_angles,
     misfit_of_angles,
 )
@@ -53,17 +52,6 @@ def naive_plane(xyz):
     return kept.sum(), axes[2], np.sort(singular**2 / kept.sum())
 
 
-@pytest.mark.parametrize("points", [6, 8, 12])
-def test_errors_of_planes_of_few_points_are_right(rng, points):
-    n = 3000
-    xyz = np.concatenate([slope(rng, points, 40.0) for _ in range(n)])
-    planes = fit_planes(xyz, np.repeat(np.arange(n), points), n)
-    angle, error = measure_angles(planes, np.tile([0, 0, -1.0], (n, 1)))
-    whole = planes.kept == points
-    square = np.mean((angle[whole] - np.radians(40.0)) ** 2)
-    assert whole.mean() > 0.95 and square / np.mean(error[whole] ** 2) == pytest.approx(1.0, abs=0.12)
-
-
 def test_many_planes_at_once_are_those_of_a_loop(rng):
     sets = [slope(rng, rng.integers(8, 60), rng.uniform(0, 70)) for _ in range(150)]
     for xyz in sets[::2]:
@@ -78,29 +66,6 @@ def test_many_planes_at_once_are_those_of_a_loop(rng):
         assert planes.spreads[number] == pytest.approx(spreads, rel=1e-6, abs=1e-12)
 
 
-def test_a_plane_does_not_depend_on_the_others(rng):
-    sets = [slope(rng, 20, 30) for _ in range(40)]
-    group = np.repeat(np.arange(40), 20)
-    whole = fit_planes(np.concatenate(sets), group, 40)
-    for number in (0, 7, 39):
-        alone = fit_planes(sets[number], group[:20], 1)
-        for a, b in zip(whole, alone, strict=True):
-            np.testing.assert_array_equal(a[number], b[0])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_quarter_of_outliers_is_left_out_or_leaves_no_plane(seed):
-    rng = np.random.default_rng(seed)
-    n, k = 400, 40
-    xyz = np.stack([slope(rng, k, 25) for _ in range(n)])
-    xyz[:, : k // 4, 2] += 1.5
-    planes = fit_planes(xyz.reshape(-1, 3), np.repeat(np.arange(n), k), n)
-    angle, _ = measure_angles(planes, np.tile([0, 0, -1.0], (n, 1)))
-    assert is_flat(planes.spreads).mean() > 0.6
-    wrong = np.abs(np.degrees(angle) - 25) > 3
-    assert wrong[is_flat(planes.spreads)].mean() < 0.01
-
-
 @pytest.mark.parametrize("degrees", [0, 1, 10, 60])
 @pytest.mark.parametrize("seed", range(2))
 def test_errors_are_what_they_say(degrees, seed):
@@ -112,27 +77,6 @@ def test_errors_are_what_they_say(degrees, seed):
     off = np.degrees(angle) - degrees
     assert 0.58 < (np.abs(off) <= np.degrees(error)).mean() < 0.80
     assert abs(np.median(off)) < 0.3 or degrees < 2
-
-
-def test_angles_are_folded_and_of_the_ray():
-    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.3, 0]])
-    planes = fit_planes(np.tile(flat, (4, 1)), np.repeat(np.arange(4), 5), 4)
-    rays = np.array([[0, 0, -1], [0, 0, 1], [0.6, 0, -0.8], [0, -1, 0.0]])
-    angle, error = measure_angles(planes, rays)
-    assert np.degrees(angle) == pytest.approx([0, 0, np.degrees(np.arcsin(0.6)), 90], abs=1e-6)
-    assert (error > 0).all() and (error < 0.01).all()
-
-
-def test_points_in_line_have_no_certain_angle():
-    line = np.outer(np.linspace(-1, 1, 12), [1, 0.3, 0.1])
-    _, error = measure_angles(fit_planes(line, np.zeros(12, int), 1), np.array([[0, 0, -1.0]]))
-    assert error[0] > 1
-
-
-def test_one_normal(rng):
-    xyz = slope(rng, 500, 20) + [5e5, 5e6, 100]
-    (normal,) = fit_planes(xyz - xyz.mean(axis=0), np.zeros(len(xyz), np.int64), 1).normal
-    assert np.degrees(np.arccos(abs(normal[2]))) == pytest.approx(20, abs=0.3)
 
 
 def test_chance_of_two_planes_is_that_of_f():
@@ -230,15 +174,6 @@ def test_a_plane_is_seldom_taken_for_two(count):
     assert (off == 0).mean() > 0.8 and (off >= 0).all()
 
 
-def test_few_points_or_points_in_line_have_no_halves():
-    line = np.outer(np.linspace(-1, 1, 12), [1, 0.3, 0.1])
-    few = np.random.default_rng(1).uniform(-1, 1, (6, 3))
-    points, group = np.concatenate([line, few]), np.repeat([0, 1], [12, 6])
-    halves = compare_halves(points, group, fit_planes(points, group, 3))
-    np.testing.assert_array_equal(halves.chance, 1)
-    np.testing.assert_array_equal(halves.tilts, 0)
-
-
 def test_reasons():
     rng = np.random.default_rng(5)
     flat = np.column_stack([rng.uniform(0, 20, (1500, 2)), 0.01 * rng.standard_normal(1500)])
@@ -263,35 +198,6 @@ def test_reasons():
     np.testing.assert_array_equal(np.isnan(error), gap != normals.Gap.KNOWN)
     assert angle.dtype == error.dtype == np.float32
     assert np.nanmedian(angle) == pytest.approx(np.degrees(np.arctan(0.2)), abs=0.1)
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_no_points_and_one(count):
-    points = np.zeros((count, 3))
-    (angle, _), gap = normals.measure_normals(points, np.ones((count, 3)), normals.Surroundings(points), **SETTINGS)
-    assert len(angle) == count and (gap == normals.Gap.FEW_NEIGHBOURS).all()
-
-
-def test_a_point_does_not_depend_on_what_is_asked_with_it(rng):
-    points = np.column_stack([rng.uniform(0, 30, (3000, 2)), rng.normal(0, 0.05, 3000)]).round(2)
-    ray = rng.normal(0, 0.2, (3000, 3)) - [0, 0, 1]
-    around = normals.Surroundings(points)
-    (angle, error), gap = normals.measure_normals(points, ray, around, **SETTINGS)
-    some = rng.permutation(3000)[:500]
-    (again, error_again), gap_again = normals.measure_normals(points[some], ray[some], around, **SETTINGS, pairs=1000)
-    np.testing.assert_array_equal(again, angle[some])
-    np.testing.assert_array_equal(error_again, error[some])
-    np.testing.assert_array_equal(gap_again, gap[some])
-
-
-def test_dense_points_are_thinned_alike_whatever_else_is_there(rng):
-    xyz, row = rng.uniform(0, 4, (20_000, 3)), np.arange(20_000)
-    kept = normals.thin_out(xyz, row, 1.0)
-    cells, number = np.unique(np.floor(xyz[kept] / 0.25), axis=0, return_counts=True)
-    assert number.max() == normals.MOST_PER_CELL and len(cells) == len(np.unique(np.floor(xyz / 0.25), axis=0))
-    part = np.flatnonzero(xyz[:, 0] < 2.0)
-    np.testing.assert_array_equal(normals.thin_out(xyz[part], row[part], 1.0), kept[part])
-    assert normals.thin_out(xyz[:200], row[:200], 0.1).all()
 
 
 def test_every_point_lies_in_one_tile_and_its_neighbours_are_listed(rng):

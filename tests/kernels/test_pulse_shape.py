@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 SHAPES = {
     "gaussian": PulseShape(),
@@ -44,18 +44,6 @@ def test_derivatives_equal_differences(shape):
         np.testing.assert_allclose(by_width, s * plain[:, 1], atol=5e-6)
 
 
-def test_single_precision_is_close_to_double(shape):
-    x = np.arange(40.0)
-    for single, double in zip(evaluate(shape, x, 17.3, 2.1, np.float32), evaluate(shape, x, 17.3, 2.1), strict=True):
-        assert single.dtype == np.float32
-        np.testing.assert_allclose(single, double, atol=2e-5)
-
-
-def test_samples_that_take_no_part_get_nothing(shape):
-    for part in evaluate(shape, [-1e4], [3.0], [2.0], np.float32):
-        assert part.item() == 0
-
-
 @pytest.mark.parametrize("kappa", [1e-2, 1e-3, 1e-4, -1e-3])
 def test_skew_moves_a_gaussian_by_0_580_of_its_size(kappa):
     """max |z^3| exp(-z^2/2) / 2 = 0.5797 at z = sqrt(3); the 0.548 of docs/algorithms.md H4 is too small."""
@@ -63,30 +51,3 @@ def test_skew_moves_a_gaussian_by_0_580_of_its_size(kappa):
     skewed = evaluate(PulseShape(kappa=kappa), z, 0.0, 1.0)[0][:, 0]
     gauss = np.exp(-0.5 * z * z)
     assert np.abs(skewed - gauss).max() == pytest.approx(0.5797 * abs(kappa), rel=0.02, abs=2e-7)
-
-
-@pytest.mark.parametrize("kappa", [1e-5, 2e-6, 1.01e-6, 1e-7, 1e-9, 1e-12, 0.0])
-def test_all_functions_are_continuous_through_no_skew(kappa):
-    z = np.arange(-5, 5, 0.1)
-    for skewed, gauss in zip(
-        evaluate(PulseShape(kappa=kappa), z, 0.0, 1.0), evaluate(GAUSSIAN, z, 0.0, 1.0), strict=True
-    ):
-        np.testing.assert_allclose(skewed, gauss, atol=6 * kappa + 1e-6)
-
-
-@pytest.mark.parametrize("kappa", [0.3, -0.3, 1.0])
-def test_nothing_before_the_origin_of_a_skewed_pulse(kappa):
-    z = -np.sign(kappa) * (1 / abs(kappa) + np.array([0.0, 1e-3, 0.5, 10, 1e4]))
-    for part in evaluate(PulseShape(kappa=kappa), z, 0.0, 1.0, np.float32):
-        assert np.isfinite(part).all()
-        assert np.abs(part).max() == 0
-
-
-@pytest.mark.parametrize("kappa", [0.05, 0.2, -0.2])
-def test_a_skewed_pulse_has_the_stated_peak_width_and_area(kappa):
-    z = np.arange(-15, 30, 0.001) * np.sign(kappa)
-    pulse = evaluate(PulseShape(kappa=kappa), z, 0.0, 1.0)[0][:, 0]
-    assert pulse.max() == pytest.approx(1, abs=1e-9)
-    assert z[np.argmax(pulse)] == pytest.approx(0, abs=2e-3)
-    assert (pulse >= 0.5).sum() * 0.001 == pytest.approx(2 * np.sinh(1.17741 * kappa) / kappa, abs=3e-3)
-    assert pulse.sum() * 0.001 == pytest.approx(np.sqrt(2 * np.pi) * np.exp(kappa**2 / 2), rel=1e-4)

@@ -12,7 +12,7 @@ from wavebatch.kernels.signal.filters import (
     gaussian_taps,
     refine_peaks,
 )
-from wavebatch.kernels.signal.runs import find_runs
+from wavebatch.kernels.signal.runs import find_runs, walk_down
 
 
 @pytest.fixture
@@ -154,3 +154,15 @@ def test_refined_peaks_stay_put_where_no_parabola_holds():
     refined, height = refine_peaks(signal, *at)
     assert refined.tolist() == [0, 4, 7, 3]
     assert height.tolist() == [5, 7, 9, 9]
+
+
+@pytest.mark.parametrize(("text", "peak", "level", "ahead", "behind"), [
+    ("0 2 4 8 6 2 1", 3, 3.0, 4.75, 1.5), ("0 2 4 8 6 2 1", 3, 8.0, 3.0, 3.0), ("0 2 4 8 6 2 1", 3, 2.0, 5.0, 1.0),
+    ("0 2 4 8 6 2 1", 3, -1.0, 6.0, 0.0), ("5 3 8 5 6 0 0", 2, 4.0, 3.0, 1.2), ("8 8 8 4 4 4 0", 1, 4.0, 3.0, 0.0),
+    ("8 8 8 4 4 4 0", 1, 3.0, 5.25, 0.0), ("8 8 8 4 4 4 0", 1, 8.0, 2.0, 0.0), ("9", 0, 1.0, 0.0, 0.0),
+])  # fmt: skip
+def test_walks_end_at_the_level_a_rise_or_the_end(text, peak, level, ahead, behind):
+    signal = np.array(text.split(), np.float32)[:, None] * np.ones(3, np.float32)
+    for step, place in ((1, ahead), (-1, behind)):
+        found = walk_down(signal, np.array([2, 0]), np.full(2, peak), np.full(2, level), step)
+        assert found.tolist() == pytest.approx([place] * 2)

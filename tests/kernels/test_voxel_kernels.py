@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wavebatch.kernels.geometry import voxels
-from wavebatch.kernels.signal.deconvolve import keep_signal, measure_offsets, window_signal
+from wavebatch.kernels.signal.deconvolve import keep_signal, measure_offsets
 
 
 def walk(start, step, begin, end, size):
@@ -50,28 +50,6 @@ def test_crossings_are_those_of_a_slow_walk(size, seed):
         assert found.inside[mine] == pytest.approx([one[2] for one in expected], abs=1e-9)
 
 
-def test_rays_along_faces_and_through_edges_lie_in_one_voxel_at_a_time():
-    start = np.array([[1.0, 0.5, 5.0], [0.0, 0.0, 0.0], [0.25, 0.25, 3.0], [2.5, 2.5, 2.5]])
-    step = np.array([[0.0, 0.0, -1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    begin, end = np.array([0.0, 0.0, 0.0, 1.5]), np.array([3.0, 4.0, 2.0, 3.0])
-    found = voxels.cross_voxels(start, step, begin, end, 1.0)
-    cells = [found.voxel[found.ray == row].tolist() for row in range(4)]
-    assert cells[0] == [[1, 0, 4], [1, 0, 3], [1, 0, 2]]
-    assert cells[1] == [[i, i, i] for i in range(4)]
-    assert cells[2] == [[0, 0, 3]]
-    assert cells[3] == [[0, 2, 2], [-1, 2, 2]]
-
-
-def test_rays_do_not_know_of_each_other():
-    rays = draw_rays(np.random.default_rng(4), 500)
-    whole = voxels.cross_voxels(*rays, 0.3)
-    parts = [voxels.cross_voxels(*(values[row : row + 1] for values in rays), 0.3) for row in range(0, 500, 7)]
-    for row, part in zip(range(0, 500, 7), parts, strict=True):
-        mine = whole.ray == row
-        for name in ("enter", "inside", "voxel"):
-            assert np.array_equal(getattr(whole, name)[mine], getattr(part, name))
-
-
 def test_slices_of_rays_cover_all_and_stay_small():
     rays = draw_rays(np.random.default_rng(5), 300)
     slices = voxels.split_rays(*rays, 0.2, crossings=2000)
@@ -84,27 +62,12 @@ def test_slices_of_rays_cover_all_and_stay_small():
     assert len(voxels.cross_voxels(*(values[:0] for values in rays), 0.2).ray) == 0
 
 
-def test_keys_sort_as_indices_and_come_back(rng):
-    limits = [1 << (bits - 1) for bits in voxels.KEY_BITS]
-    index = np.stack([rng.integers(-limit, limit, 2000) for limit in limits], axis=1)
-    index[0], index[1] = [-limit for limit in limits], [limit - 1 for limit in limits]
-    keys = voxels.pack_index(index)
-    assert np.array_equal(voxels.unpack_index(keys), index)
-    assert np.array_equal(np.argsort(keys), np.lexsort(index.T[::-1]))
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e9, 1e300])
 @pytest.mark.parametrize("what", [0, 1, 2])
 def test_rays_that_keys_cannot_reach_are_refused(bad, what):
     rays = [values.copy() for values in draw_rays(np.random.default_rng(6), 5)]
     rays[what].reshape(5, -1)[2, -1] = bad
     assert voxels.fits_keys(*rays, 0.5).tolist() == [True, True, False, True, True]
-
-
-def test_a_ray_of_too_many_voxels_does_not_fit():
-    start, step = np.zeros((2, 3)), np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
-    times = np.zeros(2), np.full(2, 1e4)
-    assert voxels.fits_keys(start, step, *times, 0.005).tolist() == [True, False]
 
 
 def slow_sum(time, spacing, value, until):
@@ -139,14 +102,6 @@ def test_sums_over_time_spread_every_sample_over_its_step(rng):
     assert none.tolist() == [[0, 0], [0, 0]]
 
 
-def test_differences_add_up_to_the_whole():
-    ray = np.array([0, 0, 0, 2, 2])
-    values, last = np.array([[0], [3], [7], [0], [5]]), np.array([[10], [99], [6]])
-    assert voxels.differences_along(values, ray, last).ravel().tolist() == [3, 4, 3, 5, 1]
-    none = np.empty(0, np.int64)
-    assert len(voxels.differences_along(values[:0], none, last)) == 0
-
-
 def test_runs_below_the_least_are_noise_and_the_sum_of_a_run_stays():
     profile = np.array([[0, 1, 6, -2, 0.2, 0, 0, 0.5, 0.5, 9], [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]], np.float32)
     support = np.array([[0, 1, 1, 1, 1, 0, 0, 1, 1, 0], [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]], bool)
@@ -158,19 +113,6 @@ def test_runs_below_the_least_are_noise_and_the_sum_of_a_run_stays():
     # Runs of two waveforms that touch are two, and a sum counts with its negative samples.
     apart = np.array([[0, 0, 5], [5, 0, 0], [4, -3, 0]], np.float32)
     assert not keep_signal(apart, apart != 0, np.array([8.0, 8.0, 2.0]), np.full(3, 0.3))[1].any()
-
-
-def test_windows_hold_all_support(rng):
-    support = rng.random((80, 200)) < 0.02
-    first, length = window_signal(support, 5)
-    for row in range(200):
-        places = np.flatnonzero(support[:, row])
-        if not len(places):
-            assert length[row] == 0
-            continue
-        assert first[row] <= max(places[0] - 5, 0) and first[row] + length[row] >= min(places[-1] + 6, 80)
-        assert first[row] >= 0 and first[row] + length[row] <= 80 and length[row] % 8 == 0
-    assert window_signal(np.ones((5, 2), bool), 4)[1].tolist() == [5, 5]
 
 
 def test_offsets_are_those_of_the_returns_of_a_packet():

@@ -10,7 +10,7 @@ from given_echoes import known_noise, known_system, simulate_echoes
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.waveforms import Noise, WaveformBlock
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.fit import render
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
@@ -54,25 +54,6 @@ def test_the_loop_finds_the_echo_that_the_maximum_hides():
     np.testing.assert_allclose(np.median(pair, axis=0), [28, 32], atol=0.05)
 
 
-def test_the_loop_leaves_what_is_explained_alone():
-    block, noise, _ = record(400, (100, 30))
-    found = decompose("residual_loop", block, noise)
-    assert (found.count(400) == 1).mean() > 0.98
-    assert_same(
-        decompose("residual_loop", block, noise, t_diff=1e9), decompose("gaussian", block, noise, tolerance=0.1)
-    )
-
-
-def test_the_loop_stops_at_its_number_of_echoes():
-    rng = np.random.default_rng(3)
-    block = WaveformBlock.from_samples(rng.integers(0, 256, (50, 80)).astype(np.uint8))
-    noise = Noise(np.full(50, 20, np.float32), np.ones(50, np.float32))
-    for most in (1, 3):
-        start = decompose("gaussian", block, noise, tolerance=0.1).count(50)
-        number = decompose("residual_loop", block, noise, max_echoes=most).count(50)
-        assert (number <= np.maximum(start, most) + 1).all()
-
-
 @pytest.mark.parametrize(("width", "lost"), [(2.0, 1.0), (3.0, 1.13), (4.0, 1.4)])
 def test_asdf_without_a_fit_is_near_the_bound_and_says_its_errors(width, lost):
     n = 3000
@@ -90,16 +71,6 @@ def test_asdf_without_a_fit_is_near_the_bound_and_says_its_errors(width, lost):
     assert np.median(found.sigma) == pytest.approx(width, rel=0.02)
     # What five samples make of a broad echo misses it by more than noise does.
     assert 0.8 < np.median(found.residual) < (1.1 if width == 2 else 1.4)
-
-
-def test_rendered_echoes_do_not_depend_on_their_parts():
-    rng = np.random.default_rng(4)
-    waveform = np.sort(rng.integers(0, 12, 60)).astype(np.int32)
-    columns = (rng.uniform(0, 30, 60), rng.uniform(5, 200, 60), rng.uniform(1, 4, 60))
-    whole = render.render_echoes(GAUSSIAN, 12, 40, waveform, *columns)
-    for rows in (1, 3, 7, 60):
-        parts = render.render_echoes(GAUSSIAN, 12, 40, waveform, *columns, rows=rows)
-        np.testing.assert_array_equal(parts, whole)
 
 
 def parse(detector, decomposer, **parameters):
@@ -128,17 +99,6 @@ def test_asdf_only_keeps_the_echoes_of_the_detector_before_it():
     for detector in ("detect.correlation", "detect.matched_filter"):
         other = parse(detector, "asdf_only").run(block, SYSTEM)
         assert len(other) == len(plain) and not np.array_equal(other.time, plain.time)
-
-
-def test_asdf_only_takes_amplitude_and_width_from_the_detector_if_told():
-    block, noise, _ = record(400, (150, 30), width=3.0)
-    given = STAGES["detect.asdf"].function(block, noise, SYSTEM)
-    found = decompose("asdf_only", block, noise, describe="detector")
-    np.testing.assert_array_equal(found.amplitude, given.amplitude)
-    np.testing.assert_array_equal(found.sigma, given.sigma)
-    # The reference is 2 ns wide: what it says of an echo of 3 ns is wrong, and its error says so.
-    assert (np.abs(found.sigma - 3) < 1.5 * found.sigma_err).mean() > 0.9
-    assert (np.abs(found.amplitude - 150) < 1.5 * found.amplitude_err).mean() > 0.9
 
 
 @pytest.mark.parametrize("detector", ["maximum", "wavelet", "threshold", "second_derivative", "richardson_lucy"])
@@ -245,17 +205,3 @@ def test_long_waveforms_are_rendered_in_pieces_that_do_not_depend_on_other_wavef
         np.testing.assert_allclose(whole[row], dense, rtol=1e-4, atol=1e-3)
         alone = render.render_echoes(shape, 1, s, np.zeros(len(own), np.int32), *(values[own] for values in columns))
         np.testing.assert_array_equal(alone[0], whole[row])
-
-
-@pytest.mark.parametrize("std", [1.0, 4.0])
-def test_the_stop_rule_in_counts_does_not_depend_on_the_noise(std):
-    """A second echo of 20 counts is added by a limit of 14 counts, whatever the noise is said to be, and not by 26."""
-    recording = replace(RECORDING, noise_std=0.1)
-    block, _ = simulate_echoes(recording, np.tile([20.0, 32.0], (40, 1)), np.array([200.0, 20.0]), 2.0,
-                               np.random.default_rng(1))  # fmt: skip
-    noise = replace(known_noise(recording, 40), std=np.full(40, std, np.float32))
-    first = EchoTable.build(np.arange(40), np.full(40, 20.0), np.full(40, 200.0), np.full(40, 2.0))
-    loop = STAGES["decompose.residual_loop"].function
-    for limit, expected in ((14.0, 2), (26.0, 1)):
-        found = loop(block, noise, SYSTEM, first, t_diff=limit, t_unit="count", significance=0.0)
-        assert (found.count(40) == expected).all(), limit

@@ -3,11 +3,9 @@
 import naive
 import numpy as np
 import pytest
-from published import PULSE_SIGMA
 
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import (
-    GAUSSIAN,
     PulseShape,
     evaluate_pulse,
     fit_one_gaussian,
@@ -15,7 +13,6 @@ from wavebatch.kernels.fit.pulse_shape import (
 )
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.decompose.models import rebuild_waveforms
-from wavebatch.stages.pulse_tables import ShapeLimits, model_parameters
 
 FINE = 100.0
 """Counts per unit of amplitude."""
@@ -33,24 +30,8 @@ def decompose(name, block, noise, system, **parameters):
     return STAGES[f"decompose.{name}"].function(block, noise, system, candidates, **parameters)
 
 
-def place_peaks(kappa, ref, echoes):
-    """Times of the peaks of skewed echoes, whose times are those of their datum [samples]."""
-    shape, limits = PulseShape(kappa=kappa), ShapeLimits(ref, 0.7 * ref, 4 * ref)
-    whole = np.stack([echoes.amplitude, echoes.time, echoes.sigma], axis=1).astype(float)
-    return model_parameters(shape, limits, whole)[:, 1]
-
-
 def evaluate(shape, x, t, s):
     return [part[:, 0] for part in evaluate_pulse(shape, x[:, None].copy(), np.array([t]), np.array([s]))]
-
-
-@pytest.mark.parametrize("power", [1.4, 2.4, 4.0])
-def test_generalized_gaussians_and_their_derivatives(power):
-    x = np.arange(-8, 14, 0.23)
-    pulse, by_time, by_width = evaluate(PulseShape(power=power), x, 3.1, 1.8)
-    np.testing.assert_allclose(pulse, naive.power_pulse(x, 3.1, 1.8, power), atol=1e-7)
-    slopes = naive.differentiate(lambda p: naive.power_pulse(x, *p, power), [3.1, 1.8])
-    np.testing.assert_allclose(np.stack([by_time, by_width], 1), 1.8 * slopes, atol=1e-5)
 
 
 def test_tabulated_pulses_and_their_derivatives():
@@ -71,50 +52,8 @@ def test_tabulated_pulses_and_their_derivatives():
     assert [part.item() for part in evaluate(shape, np.array([-1e4]), 3.0, 2.0)] == [0, 0, 0]
 
 
-def test_a_tabulated_gaussian_is_a_gaussian():
-    x = np.arange(-12.0, 13)
-    shape = PulseShape(table=tabulate_pulse(x, np.exp(-0.5 * (x / 2) ** 2)))
-    for table, plain in zip(evaluate(shape, x, 0.4, 1.7), evaluate(GAUSSIAN, x, 0.4, 1.7), strict=True):
-        np.testing.assert_allclose(table, plain, atol=4e-3)
-
-
 WANG = [(0.104, 0.0214, 0.0089, 0.0069), (0.184, 0.0158, 0.0100, 0.0037), (0, 0.0097, 0.0014, 0.0014)]
 WANG += [(0.05, 0.0186, 0.0058, 0.0052)]
-
-
-@pytest.mark.parametrize(("kappa", "noise_share", "gaussian", "log_normal"), WANG)
-def test_goodness_of_fit_of_wang(kappa, noise_share, gaussian, log_normal):
-    """T7: E = |f - y|^2 / |f|^2 of Gaussian and log-normal fits to 60 samples, FWHM 5 ns, within 10 %."""
-    n, x, sigma = 400, np.arange(60.0), PULSE_SIGMA
-    rng = np.random.default_rng(int(1e4 * noise_share))
-    time = 30 + rng.uniform(-0.5, 0.5, n)
-    std = 100 * noise_share
-    y = np.stack([100 * naive.pulse(x, t, sigma, kappa) for t in time]) + std * rng.standard_normal((n, 60))
-    block, noise = record(y, std=std)
-    system = SystemPulse(sigma, kappa=kappa)
-    for name, published in (("gaussian", gaussian), ("skewed", log_normal)):
-        found = decompose(name, block, noise, system)
-        alone = found.take(found.count(n)[found.waveform] == 1)
-        assert len(alone) > 0.95 * n
-        skew = kappa if name == "skewed" else 0
-        ratios = []
-        for echo in range(len(alone)):
-            peak = place_peaks(skew, sigma, alone)[echo]
-            f = alone.amplitude[echo] / FINE * naive.pulse(x, peak, alone.sigma[echo], skew)
-            ratios.append(np.sum((f - y[alone.waveform[echo]]) ** 2) / np.sum(f**2))
-        assert np.mean(ratios) == pytest.approx(published, rel=0.10), name
-
-
-def test_a_given_skew_overrides_that_of_the_survey():
-    x = np.arange(60.0)
-    y = np.stack([200 * naive.pulse(x, t, 2.0, 0.12) for t in np.linspace(30, 31, 9)])
-    block, noise = record(y, std=0.3)
-    found = decompose("skewed", block, noise, SystemPulse(2.0), kappa=0.12, tolerance=1e-6)
-    np.testing.assert_allclose(place_peaks(0.12, 2.0, found), np.linspace(30, 31, 9), atol=2e-3)
-    plain = decompose("skewed", block, noise, SystemPulse(2.0), tolerance=1e-6)
-    assert plain.residual.min() > 10 * found.residual.max()
-    # A Gaussian is placed where the skewed pulse has its datum.
-    np.testing.assert_allclose(plain.time, found.time, atol=5e-3)
 
 
 @pytest.mark.parametrize("model", ["broadened", "stretched", "given"])

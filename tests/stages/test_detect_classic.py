@@ -1,15 +1,11 @@
 """Classic detectors, ours and the papers': isolated echoes, detection probabilities (docs/algorithms.md 1.3), runs."""
 
-import naive
 import numpy as np
 import pytest
 from contract_tools import record
 from given_echoes import fine_recording, known_system
 from published import PULSE_SIGMA as SIGMA
 
-from wavebatch.core.waveforms import Noise, WaveformBlock
-from wavebatch.kernels.signal.filters import filter_antisymmetric, slope_taps
-from wavebatch.kernels.signal.runs import find_runs, run_moments
 from wavebatch.stages.chain import STAGES
 
 SYSTEM = known_system(fine_recording(1.0, SIGMA))
@@ -79,52 +75,3 @@ def test_pairs_with_one_run_are_one_echo_for_levels_and_two_for_derivatives():
     np.testing.assert_allclose(detect("zero_crossing", block, noise).time, [30, 37], atol=0.4)
     inflections = detect("zero_crossing", block, noise, derivative="second")
     np.testing.assert_allclose(inflections.time, [30, 37], atol=0.5)
-
-
-def test_half_of_the_distance_of_the_inflections_is_the_width():
-    block, noise = record(20, (200, np.linspace(39, 41, 20)), std=0.0)
-    np.testing.assert_allclose(detect("zero_crossing", block, noise, derivative="second").sigma, SIGMA, rtol=0.03)
-
-
-def test_noise_never_lasts_as_long_as_a_pulse():
-    block, noise = record(5000, seed=5, s=200)
-    assert len(detect("sustained_threshold", block, noise)) == 0
-
-
-def test_a_pulse_of_twenty_samples_per_ns_must_last_a_hundred_samples():
-    s, spacing = 400, 0.05
-    y = np.zeros((2, s))
-    y[0, 100:199] = y[1, 100:200] = 5
-    block = WaveformBlock.from_samples(np.rint(500 + 100 * y).astype(np.uint16), spacing=spacing)
-    noise = Noise(np.full(2, 500, np.float32), np.full(2, 100, np.float32))
-    assert detect("sustained_threshold", block, noise).waveform.tolist() == [1]
-
-
-def test_moments_of_runs_equal_those_of_a_loop():
-    signal = np.random.default_rng(17).integers(-1, 5, (17, 80)).astype(np.float32)
-    level = np.random.default_rng(2).integers(-2, 4, 80).astype(np.float32)
-    mean, spread = run_moments(signal, *find_runs(signal, level))
-    expected = naive.find_runs(signal, level)
-    assert len(mean) == len(expected) > 10
-    for row, (w, a, b) in enumerate(expected):
-        y, x = np.maximum(signal[a:b, w], 0), np.arange(a, b)
-        middle = np.average(x, weights=y) if y.any() else (a + b - 1) / 2
-        assert mean[row] == pytest.approx(middle, abs=1e-9)
-        variance = np.average((x - middle) ** 2, weights=y) if y.any() else 0
-        assert spread[row] ** 2 == pytest.approx(variance, abs=1e-9)
-
-
-@pytest.mark.parametrize("s", [1, 4, 50])
-def test_antisymmetric_filters_equal_a_double_loop(s):
-    signal = np.random.default_rng(4).standard_normal((s, 5)).astype(np.float32)
-    taps = slope_taps(1.2)
-    expected = np.stack([naive.correlate_antisymmetric(column, taps) for column in signal.T], axis=1)
-    np.testing.assert_allclose(filter_antisymmetric(signal, taps), expected, atol=1e-5)
-
-
-def test_slopes_of_straight_lines_are_exact():
-    line = np.linspace(0, 30, 31, dtype=np.float32)[:, None] * 3
-    taps = slope_taps(1.2)
-    reach = len(taps)
-    slopes = filter_antisymmetric(line, taps)
-    np.testing.assert_allclose(slopes[reach:-reach], 3, rtol=1e-5)

@@ -71,17 +71,6 @@ def test_variants_give_the_same_bits_for_any_block_size(mixed, name, parameters)
         assert_same(EchoTable.concatenate(parts), whole)
 
 
-def test_parts_of_a_block_do_not_show(mixed):
-    """More waveforms than are worked on at a time, 1024."""
-    (block, system), copies = mixed, 19
-    many = WaveformBlock.from_samples(np.tile(block.samples, (copies, 1)))
-    for name in ("detect.asdf", "detect.correlation", "detect.richardson_lucy"):
-        one = call(name, {}, block, system)
-        parts = [(one, copy * len(block)) for copy in range(copies)]
-        assert_same(call(name, {}, many, system), EchoTable.concatenate(parts))
-        assert np.unique(one.waveform).size > 40
-
-
 @pytest.mark.parametrize("name", sorted(name for name in STAGES if name.startswith(("detect.", "decompose."))))
 @pytest.mark.parametrize("s", [1, 2, 80])
 def test_a_constant_waveform_holds_no_echo(name, s):

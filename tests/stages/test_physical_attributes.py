@@ -8,9 +8,9 @@ import pytest
 from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain_no_data
+from wavebatch.core.no_data import NoData, count_reasons
 from wavebatch.core.units import HALF_C
-from wavebatch.core.waveforms import LevelWidths, Noise, Radiometry, ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, Radiometry, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.column_names import describe
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
@@ -20,11 +20,7 @@ from wavebatch.stages.attribute.radiometry import echo_light
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
-from wavebatch.surveying import survey_block
-from wavebatch.surveying.calibration import with_physics
 from wavebatch.surveying.flat_ground import SLOPE, predict_angles
-from wavebatch.tools.simulate.render import AIR_SPEED
-from wavebatch.tools.simulate.scenes import find_scene, simulate_pulses
 
 SYSTEM = SystemPulse(
     1.2,
@@ -99,15 +95,6 @@ def test_what_is_uncertain_for_all_echoes_is_in_the_error(system, gamma, section
     done = run(block, echoes, system, "backscatter_coefficient", "cross_section").attributes
     for name, error in (("backscatter_coefficient", gamma), ("cross_section", section)):
         assert done[f"{name}_err"] / done[name] == pytest.approx(error, rel=0.01, abs=1e-4)
-
-
-def test_reflectance_by_the_width_of_the_echo():
-    block, echoes, energy = make(np.full(500, 30.0), snr=3000.0)
-    done = run(block, echoes, SYSTEM, "incidence_angle", "backscatter_coefficient", "reflectance",
-               reflectance={"surface": "echo"}).attributes  # fmt: skip
-    factor = 1.0 / np.cos(np.pi / 6)
-    assert np.median(done["reflectance"] / done["backscatter_coefficient"]) * 4 == pytest.approx(factor, rel=0.002)
-    assert (done["reflectance_err"] > 0).all()
 
 
 def test_reflectance_by_normals_waits_for_the_second_pass():
@@ -197,13 +184,6 @@ def test_what_is_not_known_is_no_data(system, known):
         assert np.isfinite(done[name]).all() if name in known else np.isnan(done[name]).all(), name
 
 
-def test_without_a_sensor_nothing_is_known():
-    block, echoes, _ = make(np.full(50, 30.0))
-    for sensor in (None, np.full((50, 3), np.nan)):
-        done = run(replace(block, sensor=sensor), echoes, SYSTEM, *NAMES).attributes
-        assert all(np.isnan(done[name]).all() for name in COLUMNS)
-
-
 def test_light_of_fits_at_a_bound_is_an_estimate_for_sums_and_no_reflectance():
     block, echoes, _ = make(np.full(3, 30.0))
     echoes = echoes.with_flags(EchoFlag.AT_BOUND, np.array([True, False, False]))
@@ -226,45 +206,6 @@ def test_angles_of_a_village_and_their_errors():
     assert np.mean(np.abs(off) < error) == pytest.approx(0.683, abs=0.05)
 
 
-def with_sensor(made):
-    """The simulated block with the true positions of the sensor."""
-    back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
-    return replace(made.block, sensor=made.rays.ground - back)
-
-
-def test_angles_of_simulated_slopes():
-    off, errors = [], []
-    scene = find_scene("slope")
-    chain = with_physics(load_profile("balanced"), sensor=True, calibrated=False, divergence=True)
-    system = None
-    for part in range(3):
-        made = simulate_pulses(scene, 2000, np.random.default_rng(part), first=2003 * part)
-        block = with_sensor(made)
-        # On slopes alone the system's width cannot be measured: level ground elsewhere, or SYSTEM.toml, must say it.
-        # So must the scatter of widths, which is measured below the system's width: slopes have moved that by 0.015 ns.
-        known = {"sigma_ref": scene.recording.pulse.sigma, "widths": LevelWidths()}
-        found = survey_block(block).system.with_radiometry(divergence=scene.divergence)
-        system = system or replace(found, **known)
-        echoes = chain.run(block, system)
-        true = np.degrees(made.rays.incidence)[echoes.waveform]
-        off.append(echoes.attributes["incidence_angle"] - true)
-        errors.append(echoes.attributes["incidence_angle_err"])
-    off, errors = np.concatenate(off), np.concatenate(errors)
-    known = np.isfinite(off)
-    assert 0.45 < known.mean() < 1.0
-    assert np.median(np.abs(off[known])) == pytest.approx(np.median(0.6745 * errors[known]), rel=0.2)
-    # Intervals of echoes that just passed the limit are longer towards 0, but one number stands for both sides.
-    assert np.mean(np.abs(off[known]) < errors[known]) == pytest.approx(0.683, abs=0.08)
-
-
-def test_an_infrared_beam_has_no_angles():
-    system = replace(SYSTEM, sigma_ref=1.7, radiometry=replace(SYSTEM.radiometry, divergence=0.4))
-    block, echoes, _ = make(np.linspace(0, 40, 500), snr=50.0)
-    narrow = replace(echoes, sigma=np.full(500, 1.7, np.float32))
-    done = run(block, narrow, system, "incidence_angle").attributes
-    assert np.isnan(done["incidence_angle"]).all() and np.isnan(done["incidence_angle_err"]).all()
-
-
 def test_modes_agree_where_they_should():
     block, echoes, _ = make(np.full(400, 45.0), snr=2000.0)
     angle = {
@@ -275,30 +216,6 @@ def test_modes_agree_where_they_should():
     assert angle["system"] == pytest.approx(45.0, abs=0.2)
     assert angle["pulse"] == pytest.approx(45.0, abs=3.0)
     assert angle["paper"] > 60.0
-
-
-def test_a_learned_pulse_has_its_own_width():
-    components = ((1.0, 0.0, 1.2), (0.2, 2.5, 1.8))
-    system = replace(SYSTEM, components=components)
-    shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)
-    block, echoes, _ = make(np.full(50, 40.0), snr=1000.0)
-    wide = np.hypot(1.2, spread_of_angle(np.radians(40.0), 640.0, 1.1e-3))
-    whole = whole_pulse(shape, limits, np.tile([100.0, 20.0, wide], (50, 1)))
-    echoes = replace(echoes, sigma=whole[:, 2].astype(np.float32), sigma_err=np.full(50, 0.01, np.float32))
-    done = run(block, echoes, system, "incidence_angle").attributes
-    assert done["incidence_angle"] == pytest.approx(40.0, abs=0.3)
-
-
-def test_blocks_cut_anywhere_give_the_same_bits():
-    block, echoes, _ = make(np.linspace(0, 70, 301))
-    whole = run(block, echoes, SYSTEM, *NAMES).attributes
-    for start, stop in [(0, 1), (1, 8), (8, 301)]:
-        rows = np.arange(start, stop)
-        part = echoes.take(rows)
-        part = replace(part, waveform=(part.waveform - start).astype(np.int32))
-        done = run(block.rows(slice(start, stop)), part, SYSTEM, *NAMES).attributes
-        for name in COLUMNS:
-            np.testing.assert_array_equal(done[name], whole[name][rows])
 
 
 def reasons(echoes):
@@ -326,33 +243,6 @@ def test_every_missing_value_has_a_reason(system, sensor, column, reason):
         block = replace(block, sensor=None)
     done = run(block, echoes, system, *NAMES)
     assert reasons(done)[column] == {reason.name: 50}
-
-
-def test_reasons_of_single_echoes_and_that_they_add_up():
-    block, echoes, _ = make(np.full(12, 30.0), snr=300.0)
-    marks = (EchoFlag.SATURATED | EchoFlag.AMPLITUDE_UNRELIABLE, EchoFlag.NEAR_EDGE, EchoFlag.NOT_CONVERGED,
-             EchoFlag.AT_BOUND, EchoFlag.MERGED)  # fmt: skip
-    for row, flag in enumerate(marks):
-        echoes = echoes.with_flags(flag, np.arange(12) == row)
-    names = [name.replace("level_", "") for name in NAMES]
-    done = run(block, echoes, SYSTEM, names[-1], *names[:-1], reflectance={"surface": "echo"})
-    told = reasons(done)
-    assert told["incidence_angle"] == {"KNOWN": 7, "OVERLAPPED": 1, "SATURATED": 1, "CUT": 1, "UNSETTLED": 2}
-    assert told["cross_section"] == {"KNOWN": 11, "SATURATED": 1}
-    assert told["reflectance"] == {"KNOWN": 7, "SATURATED": 1, "UNSETTLED": 1, "NO_ANGLE": 3}
-    assert set(told) == set(names)
-    for name, counts in told.items():
-        assert sum(counts.values()) == 12
-        assert np.isfinite(done.attributes[name]).sum() == counts["KNOWN"]
-
-
-def test_the_first_reason_counts_and_all_are_explained():
-    values = np.array([1.0, np.nan, np.nan, np.inf])
-    first = np.array([True, True, False, False])
-    codes = explain_no_data(values, (NoData.NO_SENSOR, first), (NoData.CUT, np.array([True, True, True, False])))
-    assert codes.tolist() == [NoData.KNOWN, NoData.NO_SENSOR, NoData.CUT, NoData.OTHER]
-    assert explain_no_data(values, (NoData.NO_SENSOR, True)).tolist() == [0, 1, 1, 1]
-    assert set(REASONS) == set(NoData) - {NoData.KNOWN}
 
 
 def test_echoes_that_are_far_too_narrow_are_flagged():
@@ -568,17 +458,6 @@ def test_steep_slopes_have_angles_where_the_box_of_widths_lets_them(system, deco
     assert abs(np.median(off[known])) < 0.3
     error = found.attributes["incidence_angle_err"][known]
     assert np.mean(np.abs(off[known]) < error) == pytest.approx(0.68, abs=0.08)
-
-
-def test_attributes_read_widths_as_the_pulse_that_was_fitted():
-    """On a skewed strip a Gaussian's width at half maximum is 2.3548 sigma, not that of the survey's pulse."""
-    block = planes(SKEWED, 0.0, n=50)
-    text = "".join(
-        f'[[chain]]\nstage = "{name}"\n'
-        for name in ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.echo_width")
-    )
-    found = parse_chain(text, "c").run(block, SKEWED)
-    np.testing.assert_allclose(found.attributes["echo_width"], 2.354820 * found.sigma, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kappa", [0.0, 0.2, 0.4])

@@ -11,7 +11,6 @@ import wavebatch as wb
 from wavebatch import surveying
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
-from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.compare_chains import measure_fit
 
@@ -105,29 +104,6 @@ def test_a_wrong_skew_is_refused(value):
         parse_chain(f"{TEXT}\nkappa = {value}", "c")
 
 
-def test_too_few_echoes_leave_the_skew_unknown():
-    block, _, _ = strip([0.2], n=15)
-    assert surveying.survey_block(block).system.skew is None
-
-
-def test_stages_says_numbers_and_words():
-    parameter = STAGES["decompose.skewed"].parameters["kappa"]
-    assert parameter.types == (float, str) and parameter.choices == ("free",) and parameter.range == (-0.9, 0.9)
-
-
-@pytest.mark.parametrize("power", [1.4, 2.0, 4.0])
-def test_the_energy_of_a_generalized_gaussian_is_that_of_its_exponent(power):
-    """As a Gaussian of its width it would be 7 % too large (flat) to 11 % too small (peaked)."""
-    x, time = np.arange(90.0), np.linspace(40, 41, 30)
-    y = 5000 * naive.power_pulse(x, time[:, None], 3.0, power)
-    counts = np.rint(1000 + y + np.random.default_rng(1).standard_normal(y.shape)).astype(np.uint16)
-    text = TEXT.replace("skewed", "generalized_gaussian") + '\n[[chain]]\nstage = "attribute.energy"'
-    system = SystemPulse(2.4, noise=ReceiverNoise(baseline=1000.0, std=1.1))
-    found = parse_chain(text, "c").run(WaveformBlock.from_samples(counts), system)
-    energy = np.bincount(found.waveform, found.attributes["energy"])
-    assert np.median(energy / y.sum(axis=1)) == pytest.approx(1.0, abs=0.01)
-
-
 @pytest.mark.parametrize("decomposer", ["generalized_gaussian", "skewed"])
 def test_a_deviation_from_the_pulse_needs_one_pulse(decomposer):
     extra = '\nkappa = "free"' if decomposer == "skewed" else ""
@@ -160,11 +136,3 @@ def test_a_real_strip_has_the_ratio_of_the_paper(leica):
     gaussian, one = (measure_real(leica, name)[0] for name in ("gaussian", "skewed"))
     free = measure_real(leica, "skewed", kappa="free")[0]
     assert 0.45 < one / gaussian < 0.65 and free <= one * 1.01
-
-
-@pytest.mark.parametrize(
-    ("model", "low", "high"), [("gaussian", 0.5, 0.9), ("skewed", 0.05, 0.2), ("learned", 0.0, 0.01)]
-)
-def test_false_echoes_of_the_residual_loop_on_real_single_returns(leica, model, low, high):
-    """Its gain on a real strip is the misfit of its pulse: docs/algorithms.md 1.2."""
-    assert low <= measure_real(leica, "residual_loop", model=model)[1] <= high

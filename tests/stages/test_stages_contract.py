@@ -149,16 +149,6 @@ def test_stages_give_the_same_bits_for_any_block_size(scene, size):
             raise
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_permuted_waveforms_give_permuted_echoes(scene, profile):
-    block, system = scene
-    order = np.random.default_rng(4).permutation(len(block))
-    chain = load_profile(profile)
-    whole, mixed = chain.run(block, system), chain.run(block.rows(order), system)
-    back = replace(mixed, waveform=order[mixed.waveform].astype(np.int32))
-    assert_same(back.take(np.argsort(back.waveform, kind="stable")), whole)
-
-
 @pytest.mark.parametrize("name", STAGES)
 def test_every_stage_says_what_comes_out(name):
     stage = STAGES[name]

@@ -23,7 +23,7 @@ from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.matching import setting, strip_match
-from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_alike, weigh_change
+from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places
 from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
 
 pytestmark = pytest.mark.kept_surveys
@@ -345,14 +345,6 @@ def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fa
     assert fade or _find_fading(time, forest, place).chance < 0.5
 
 
-def test_parts_of_one_field_count_as_few(rng):
-    """A slope's error is that of independent parts, and several times as large where halves are of two fields."""
-    alone = [weigh_alike(rng.standard_normal(32)) for _ in range(50)]
-    field = np.repeat([-1.0, 1.0], 16)
-    assert 1.2 < np.median(alone) < 2.5
-    assert weigh_alike(field + 0.1 * rng.standard_normal(32)) > 8
-
-
 @pytest.mark.slow
 def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, calibrated):
     even = [Facet(lambda x, y: 0.1 + 0.5 * np.abs(np.sin(y)))]
@@ -523,15 +515,6 @@ def test_a_dark_and_a_bright_target_hold_a_receiver_that_weakens_whole_pulses(tm
     assert "is assumed" not in told
     for constant in (dark, bright):
         assert abs(found.constant / constant - 1) < 1.2 * found.relative_error
-
-
-@pytest.mark.parametrize("spread", [0.04, 0.2, 0.4])
-def test_the_assumed_chance_of_a_change_says_how_much_error_holds_it(spread):
-    errors = [weigh_change(0.0, spread, 0.0, chance=chance).error for chance in (0.0, 0.05, 0.3, 0.6)]
-    assert errors[0] == 0.0 and np.all(np.diff(errors) > 0.002)
-    assert 0.3 < errors[1] / errors[2] < 0.5 and 1.2 < errors[3] / errors[2] < 2.0
-    # What the data show does not hang on it.
-    assert all(weigh_change(0.5, 0.04, 0.5, chance=chance).chance > 0.9 for chance in (0.05, 0.3, 0.6))
 
 
 def test_a_chance_of_zero_adds_nothing_for_what_scenes_do_not_show():

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pytest
 from commands import run_command as run
 from strips import descriptor, make_raw
 from writer_tools import data_file
@@ -28,35 +27,6 @@ def test_info_of_the_riegl_pair():
     assert facts["crs"].startswith("PROJCS")
     assert facts["warnings"] == facts["problems"] == []
     json.dumps(facts, allow_nan=False)
-
-
-def test_info_of_the_leica_file():
-    facts = describe_file(data_file("leica-als/simple1_3_full_internal.las"))
-    assert (facts["packets"]["count"], facts["packets"]["where"]) == (999, "internal")
-    assert facts["packets"]["descriptors"][0]["gain"] == pytest.approx(0.01729, abs=1e-5)
-
-
-def test_info_prints_text_and_json(tmp_path):
-    path = make_raw().write(tmp_path / "a.las")
-    text = run("info", path)
-    assert text.exit_code == 0
-    for word in ("point format 4", "packets           40", "toward the sensor", "32 samples of 8 bits", "CRS"):
-        assert word in text.stdout
-    result = run("info", path, "--json")
-    facts = json.loads(result.stdout)  # with header and points, which every LAS file has
-    assert facts.pop("schema") and facts == describe_file(path) and facts["gps_time"]
-
-
-def test_info_counts_samples_at_the_limit(tmp_path):
-    raw = make_raw(10, most_returns=1)
-    data = bytearray(b"\x0a" * 320)
-    data[33] = data[40] = data[100] = 255
-    raw.packets = bytes(data)
-    samples = describe_file(raw.write(tmp_path / "a.las"))["samples"]
-    assert samples == {
-        "waveforms_read": 10, "least": 10, "largest": 255, "waveforms_at_limit": 2, "waveforms_with_gaps": 0,
-        "lengths": [32],
-    }  # fmt: skip
 
 
 def test_info_of_a_strip_that_cannot_be_processed_still_tells_what_it_holds(tmp_path):

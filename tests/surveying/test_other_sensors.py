@@ -10,8 +10,6 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.text_file import write_text
-from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
-from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey, survey_block, survey_blocks
@@ -105,16 +103,6 @@ def test_widened_echoes_of_skewed_pulses_stay_whole(mirror):
     assert whole > 0.98
 
 
-def test_half_widths_of_any_sum_rise_with_its_width():
-    """Two Gaussians with a dip between them: narrower ones have a lower peak and therefore a larger half width."""
-    lobes = ((0.86, 1.92, -0.33), (0.6, -1.54, -0.55), (-0.17, 3.23, -0.83), (-0.13, -2.65, -0.9))
-    shape = PulseShape(components=lobes)
-    table = measure_pulse(shape, 0.985, 4.7)
-    assert (np.diff(table.half_width) > 0).all()
-    plain = measure_pulse(PulseShape(components=((0.1, 5.0, 1.0),)), 0.7, 4.0)
-    assert plain.half_width == pytest.approx(2.354820 * plain.width, rel=0.05)
-
-
 def drifting(seed, *, drift, noise, n=3000, top=200):
     """A strip of Gaussian echoes whose baseline rises by `drift` counts from its first to its last waveform."""
     rng = np.random.default_rng(seed)
@@ -135,15 +123,6 @@ def test_baselines_that_drift_along_the_strip_hide_no_echo(drift, noise, top):
     assert whole > 0.985
     found = STAGES["noise.pooled"].function(block, system).baseline - base
     assert np.sqrt(np.mean(found**2)) < 0.3 * np.hypot(noise, 0.289)
-
-
-def test_levels_of_waveforms_do_not_depend_on_their_neighbours(rng):
-    signal = (rng.normal(0, 1, (60, 500)) + 30 * rng.normal(size=500)).astype(np.float32)
-    level, quiet, number = find_levels(signal, 1.0, 6)
-    for column in (0, 1, 499):
-        alone = find_levels(signal[:, column : column + 1], 1.0, 6)
-        assert alone[0][0] == level[column] and alone[2][0] == number[column]
-        assert np.array_equal(alone[1][:, 0], quiet[:, column])
 
 
 def digitized(block, index, **changes):

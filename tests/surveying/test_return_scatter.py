@@ -17,9 +17,6 @@ from wavebatch.surveying.measuring.return_scatter import ReturnScatter, _measure
 
 TOWN = [*roofs([0, 20, 38, 55]), Plane(0.25)]
 HILL = [Plane(slope=(np.tan(np.radians(22.0)), 0.1))]
-COLUMNS = "x,y,z,range,range_err,range_error"
-
-
 def measure(path):
     with StripReader(path) as reader, reader.scan() as scan:
         return measure_returns(reader, scan, wb.survey(path).system)

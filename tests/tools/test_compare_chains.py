@@ -25,7 +25,6 @@ from wavebatch.tools.compare_chains import (
     match_sides,
     measure_fit,
 )
-from wavebatch.tools.pairing import compare_clouds
 
 
 def make_chain(detector, decomposer, **parameters):
@@ -97,13 +96,6 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed):
     assert parts.fit["b"]["all"].mean == pytest.approx(result.fit["b"]["all"].mean, rel=1e-12)
 
 
-def test_a_fit_with_the_right_number_of_echoes_is_at_the_noise_floor(mixed):
-    fit = match_sides(mixed / "s.las", find_contender("fast"), find_contender("accurate")).fit
-    assert fit["b"]["all"].mean == pytest.approx(fit["b"]["all"].floor_mean, rel=0.1)
-    assert fit["a"]["multi"].mean > 1.5 * fit["a"]["multi"].floor_mean
-    assert fit["a"]["both"].waveforms == fit["b"]["both"].waveforms <= fit["a"]["all"].waveforms
-
-
 def test_a_chain_and_its_own_cloud_are_identical(mixed):
     cloud = mixed / "accurate" / "s.laz"
     for sides in (("accurate", str(cloud)), (str(cloud), "accurate")):
@@ -114,25 +106,6 @@ def test_a_chain_and_its_own_cloud_are_identical(mixed):
         chain, other = ("a", "b") if sides[0] == "accurate" else ("b", "a")
         assert result.fit[other] == {} and result.fit[chain]["all"].waveforms > 600
         assert set(result.vendor) == {chain}
-
-
-def test_the_vendors_returns_as_a_cloud_has_them(mixed):
-    for profile in ("fast", "accurate"):
-        cloud = compare_clouds(mixed / profile / "s.laz", mixed / "s.las")
-        alone = match_sides(mixed / "s.las", find_contender(profile))
-        for one in (alone.between, alone.vendor["a"]):
-            # A cloud's positions are rounded to its scale: a pair at the very tolerance may be one there only.
-            assert abs(one.matched - cloud.matched) <= 2
-            assert one.differences["time"].nmad < 0.1 * one.differences["echo_time"].nmad
-            assert one.matched + one.missed == cloud.matched + cloud.missed == alone.returns
-            assert one.matched + one.extra == cloud.matched + cloud.extra
-        assert alone.between.b == str(mixed / "s.las")
-        flags = alone.between.extra_by["flag"]
-        assert flags["ADDED"][0] == flags["ADDED"][1] <= alone.between.extra
-        missed = alone.between.missed_by
-        assert sum(number for number, _ in missed["return"].values()) == alone.between.missed
-        assert sum(of for _, of in missed["amplitude"].values()) == alone.returns
-        assert alone.fit["a"]["both"].waveforms == 0
 
 
 def test_a_part_of_the_strip_and_a_saved_survey(mixed, tmp_path):
@@ -206,20 +179,6 @@ CASES += [("residual_loop", {"model": "skewed"}, {"kappa": 0.12}), ("skewed", {"
 CASES += [("skewed", {}, {"kappa": 0.12}), ("skewed", {"kappa": 0.12}, {}), ("adaptive", {}, {"kappa": 0.12})]
 
 
-@pytest.mark.parametrize(("name", "parameters", "shape"), CASES)
-def test_clean_echoes_are_rebuilt_as_they_are(name, parameters, shape):
-    """A wrong model would leave 0.002 (kappa 0.12) or more; ASDF takes its width from samples."""
-    x, kappa = np.arange(80.0), shape.get("kappa", parameters.get("kappa", 0.0))
-    y = np.stack([100 * naive.pulse(x, t, 2.0, kappa) for t in np.linspace(30, 31, 7)])
-    if "components" in shape:
-        y += 0.12 * np.stack([100 * naive.pulse(x, t + 7, 2.0) for t in np.linspace(30, 31, 7)])
-    block, noise = record(y, std=0.05)
-    system = SystemPulse(2.0, noise=ReceiverNoise(std=5.0), **shape)
-    step, found = decompose(name, block, noise, system, **parameters)
-    misfit, _ = measure_fit(block, noise, system, step, found)
-    assert misfit.shape == (7,) and misfit.max() < (2e-3 if name == "asdf_only" else 2e-4)
-
-
 def test_what_was_not_fitted_is_no_data():
     x = np.arange(80.0)
     block, noise = record(100 * naive.pulse(x, 30.0, 2.0)[None], std=0.05)
@@ -283,23 +242,3 @@ def test_the_floor_is_that_of_single_samples_where_noise_is_coloured():
     system = SystemPulse(2.0, noise=ReceiverNoise(std=1.6, by_kind={"quiet": 0.8}))
     coloured = measure_fit(block, noise, system, step, echo)[1]
     assert coloured == pytest.approx(plain / 4, rel=1e-5)
-
-
-def test_floor_of_the_specification():
-    """0.00159 for 60 samples, amplitude over noise 100, sigma 2.123."""
-    block, noise = record(100 * naive.pulse(np.arange(60.0), 30.0, 2.123)[None], std=1.0)
-    echo = EchoTable.build(np.zeros(1), np.array([30.0]), np.array([100 * FINE]), np.array([2.123]))
-    misfit, floor = measure_fit(block, noise, SystemPulse(2.123), Step(STAGES["decompose.gaussian"]), echo)
-    assert floor[0] == pytest.approx(0.00159, abs=1e-5)
-    assert misfit[0] < 1e-6
-
-
-def test_many_waveforms_are_thinned_evenly():
-    quality, step = FitQuality(1000), 137
-    misfit = np.random.default_rng(3).permutation(20_000) / 20_000
-    for begin in range(0, 20_000, step):
-        part = misfit[begin : begin + step]
-        quality.add(part, 2 * part, np.ones(len(part), int), np.ones(len(part), bool))
-    found = quality.result()["single"]
-    assert found.waveforms == 20_000 and found.mean == pytest.approx(misfit.mean())
-    assert found.median == pytest.approx(0.5, abs=0.06) and found.floor_median == 2 * found.median

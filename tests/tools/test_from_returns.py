@@ -10,17 +10,13 @@ import numpy as np
 import pytest
 from batch_tools import read_cloud, run_one
 from click.testing import CliRunner
-from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
 from wavebatch.cli.strips import synthesize
-from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
-from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.pairing import compare_clouds
-from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, returns, simulate_returns
+from wavebatch.tools.simulate import DiscreteReceiver, returns, simulate_returns
 from wavebatch.tools.simulate.returns import Radar, SynthesisOptions, synthesize_strip
 
 
@@ -52,15 +48,6 @@ def test_run_finds_the_returns_again(cloud, noise, tmp_path):
     assert result.differences["time"].nmad < 0.1
 
 
-def test_points_are_those_of_the_cloud(cloud, tmp_path):
-    for name in ("s.las", "s.laz"):
-        synthesize_strip(cloud, tmp_path / name)
-        before, after = read_cloud(cloud), read_cloud(tmp_path / name)
-        assert np.array_equal(before[1], after[1])
-        for field in before[0].dtype.names:
-            assert np.array_equal(before[0][field], after[0][field]), field
-
-
 def test_samples_are_gaussians_at_the_returns(cloud, tmp_path):
     options = SynthesisOptions(gain=0.05, width=6.0, bits=16, baseline=300.0, spacing=0.5)
     synthesize_strip(cloud, tmp_path / "s.las", options)
@@ -87,16 +74,6 @@ def test_samples_are_gaussians_at_the_returns(cloud, tmp_path):
     assert len(lengths) > 1
 
 
-def test_lone_returns_take_the_direction_of_their_scan_angle(cloud, tmp_path):
-    synthesize_strip(cloud, tmp_path / "s.las")
-    points = read_cloud(tmp_path / "s.las")[0]
-    lone = points["bit_fields"] >> 3 & 7 == 1
-    y, z = points["y_t"][lone], points["z_t"][lone]
-    assert lone.sum() > 100
-    assert -y / z == pytest.approx(np.tan(np.radians(points["scan_angle_rank"][lone])), abs=0.03)
-    assert points["x_t"][lone] / z == pytest.approx(np.full(lone.sum(), -4 / 57.3), abs=0.02)
-
-
 def test_measured_widths_come_first(cloud, tmp_path):
     synthesize_strip(cloud, tmp_path / "s.las", SynthesisOptions(width=8.0, bits=16, gain=5.0))
     run_one(tmp_path / "s.las", tmp_path / "out", profile="balanced")
@@ -107,34 +84,6 @@ def test_measured_widths_come_first(cloud, tmp_path):
     above = (block.samples - 12.0 > 0.5 * (block.samples.max(axis=1) - 12.0)[:, None]).sum(axis=1)
     assert peak.max() > 500
     assert np.percentile(above, 10) >= 7
-
-
-def test_pieces_cut_no_pulse(cloud, tmp_path):
-    synthesize_strip(cloud, tmp_path / "whole.las", SynthesisOptions(gain=0.1))
-    summary = synthesize_strip(cloud, tmp_path / "parts.las", SynthesisOptions(gain=0.1), piece=37)
-    assert summary.packets == 2000 and summary.scattered == 0
-    whole, parts = read_cloud(tmp_path / "whole.las")[0], read_cloud(tmp_path / "parts.las")[0]
-    assert np.array_equal(whole["gps_time"], parts["gps_time"])
-    assert len(np.unique(parts["wavepacket_offset"])) == 2000
-
-
-@pytest.mark.parametrize(("given", "expected"), [(4, 4), (5, 5), (9, 9), (10, 10)])
-def test_every_family_of_formats(given, expected, tmp_path):
-    simulate_returns("forest", tmp_path / "c.laz", pulses=200, options=StripOptions(point_format=given))
-    synthesize_strip(tmp_path / "c.laz", tmp_path / "s.laz", SynthesisOptions(internal=given > 5))
-    assert check_file(tmp_path / "s.laz").is_clean
-    with laspy.open(tmp_path / "s.laz", read_evlrs=False) as reader:
-        assert reader.header.point_format.id == expected
-        assert (len([v for v in reader.header.vlrs if v.user_id == "LASF_Projection"]) == 1) == (given > 5)
-    assert (tmp_path / "s.wdp").exists() == (given < 6)
-
-
-def test_lidar_equation_for_a_surface_that_fills_the_footprint():
-    distance = np.array([300.0, 800.0, 3000.0])
-    figures = {"transmitted": 4000.0, "aperture": 0.1, "efficiency": 0.4, "attenuation": 0.3}
-    power = receive_power(spread_cross_section(0.3, distance, 7e-4), distance, divergence=7e-4, **figures)
-    through = transmit(0.5 * distance, 0.3)
-    assert power == pytest.approx(4000 * 0.1**2 * 0.3 * 0.4 * through**2 / (4 * distance**2), rel=1e-12)
 
 
 def test_reflectances_are_weakened_with_range(tmp_path):
@@ -149,17 +98,6 @@ def test_reflectances_are_weakened_with_range(tmp_path):
     assert np.median(peaks[0] / peaks[1]) == pytest.approx(4 * 10 ** (2 * 0.5 * 0.22 / 10), rel=0.02)
     with pytest.raises(InputError, match="above the sensor"):
         synthesize_strip(tmp_path / "c.las", tmp_path / "x.las", SynthesisOptions("reflectance", 1.0, Radar(100.0)))
-
-
-def test_pulses_are_runs_of_equal_time_and_rising_numbers():
-    time, number = np.array([1, 1, 2, 2, 2, 2, 3.0]), np.array([1, 2, 1, 2, 1, 2, 3], np.uint8)
-    assert group_pulses(time, number).tolist() == [0, 2, 4, 6]
-    assert group_pulses(time[:0], number[:0]).tolist() == []
-
-
-def test_rays_without_enough_pairs_are_vertical():
-    rays = fit_rays(np.zeros((3, 3)), np.arange(3), np.array([0.0, 20.0, -20.0]), np.zeros(3, int))
-    assert rays.tolist() == [[0, 0, -1]] * 3
 
 
 def run(*arguments):
@@ -268,12 +206,6 @@ def test_a_wide_echo_is_lower_and_has_the_same_energy(cloud, tmp_path):
     assert ratio[lone] == pytest.approx(expected, rel=0.03)
 
 
-def test_energy_says_what_saturation_loses(cloud, tmp_path):
-    options = {**FIGURES, "bits": 8, "gain": 2e12}
-    summary = synthesize_strip(cloud, tmp_path / "s.las", SynthesisOptions("reflectance", **options))
-    assert summary.saturated > 100 and summary.energy_recorded < 0.9 * summary.energy
-
-
 @pytest.mark.parametrize(
     ("baseline", "noise", "level"), [(0.0, 2.0, 0.7), (3.0, 2.0, 3.03), (12.4, 0.0, 12.0), (12.4, 1.0, 12.4)]
 )
@@ -349,33 +281,3 @@ def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_pa
     given = add_columns(tmp_path / "first.las", tmp_path / "g.las", footprint=np.full(len(las.points), 0.3))
     said = run(given, *words, "--shares", "footprint")
     assert "shares of incomplete pulses are those of the points that are there" in said.stderr
-
-
-def test_waveforms_hold_the_echoes_that_are_given(rng):
-    recording = fine_recording(0.0, 2.0, n_samples=60, spacing=0.5)
-    time = np.array([[20.3, 9.0], [15.0, np.nan], [np.nan, np.nan]])
-    amplitude = FINE * np.array([50.0, 20.0])
-    block, truth = simulate_echoes(recording, time, amplitude, np.array([[2.0, 3.0]]), rng)
-    x = np.arange(60) * 0.5
-    expected = np.full((3, 60), 5000.0)
-    expected[0] += 5000 * np.exp(-0.5 * ((x - 20.3) / 2) ** 2) + 2000 * np.exp(-0.5 * ((x - 9) / 3) ** 2)
-    expected[1] += 5000 * np.exp(-0.5 * ((x - 15) / 2) ** 2)
-    np.testing.assert_allclose(block.samples, expected, atol=0.6)
-    assert block.spacing == 0.5
-    assert truth.waveform.tolist() == [0, 0, 1]
-    assert truth.time == pytest.approx([9.0, 20.3, 15.0])
-    assert truth.amplitude.tolist() == [2000, 5000, 5000]
-    assert truth.sigma.tolist() == [3, 2, 2]
-    assert not (truth.flags & EchoFlag.SATURATED).any()
-
-
-def test_noise_and_system_are_those_of_the_receiver(rng):
-    recording = Recording(noise_std=1.5, baseline_spread=0.0, baseline=20.0, n_samples=200)
-    block, truth = simulate_echoes(recording, np.full((300, 1), np.nan), 0.0, 2.0, rng)
-    noise, system = known_noise(recording, 300), known_system(recording)
-    assert len(truth) == 0
-    assert np.std(block.samples) == pytest.approx(noise.std[0], rel=0.01)
-    assert np.mean(block.samples) == pytest.approx(noise.baseline[0], abs=0.02)
-    assert (system.sigma_ref, system.noise.baseline) == (2.0, 20.0)
-    assert system.noise.std == pytest.approx(np.hypot(1.5, np.sqrt(1 / 12)))
-    assert known_noise(recording, 2, least=9.0).std.tolist() == [9, 9]

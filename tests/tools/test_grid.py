@@ -196,13 +196,6 @@ def test_a_crs_that_no_geotiff_can_hold_is_refused(rng, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
 
 
-def test_the_raster_of_a_real_strip_has_its_crs(riegl, tmp_path):
-    assert run_command("run", riegl, "-o", tmp_path, "-q").exit_code == 0
-    _run(tmp_path / f"{riegl.stem}.laz", "--column", "echo_width", "--size", 2, "-o", tmp_path / "x.tif")
-    with rasterio.open(tmp_path / "x.tif") as found:
-        assert found.crs.to_epsg() == 32633
-
-
 def test_cells_in_metres_are_refused_on_degrees(rng, tmp_path):
     degrees = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],UNIT["degree",0.0174532925]]'
     _cloud(tmp_path / "d.las", rng, wkt=degrees)

@@ -17,12 +17,12 @@ from wavebatch.cli.clouds import SHOWN, stats
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import publish_together
-from wavebatch.files.geojson import Polygon, find_inside, load_polygons
+from wavebatch.files.geojson import Polygon
 from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.tools import return_stats as returns
 from wavebatch.tools.return_stats import AreaGrid, PolygonSet, count_returns
-from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, simulate_returns, simulate_strip
+from wavebatch.tools.simulate import StripOptions, simulate_strip
 
 
 def write_cloud(path, time, z, number, total, *, flags=None, point_format=1):
@@ -70,22 +70,10 @@ def test_small_cloud_is_counted(tmp_path):
     assert each[0].flags is None
 
 
-def test_order_of_points_does_not_matter(tmp_path, rng):
-    order = rng.permutation(7)
-    shuffled = {name: values[order] for name, values in SMALL.items()}
-    check_small(count_returns([write_cloud(tmp_path / "c.laz", **shuffled)])[1], "gps_time")
-
-
 def test_without_times_rising_numbers_make_a_pulse(tmp_path):
     path = write_cloud(tmp_path / "c.las", **SMALL, point_format=0)
     check_small(count_returns([path])[1], "return_number")
     check_small(count_returns([path], held=2)[1], "return_number")
-
-
-def test_times_that_are_all_alike_are_not_used(tmp_path):
-    many = {name: np.tile(values, 60) for name, values in SMALL.items()} | {"time": np.zeros(420)}
-    found = count_returns([write_cloud(tmp_path / "c.las", **many)])[1]
-    assert (found.pulses, found.pulses_by) == (240, "return_number")
 
 
 @pytest.mark.parametrize("missing", [np.nan, 0.0])
@@ -99,17 +87,6 @@ def test_points_without_a_time_are_not_one_pulse(tmp_path, missing):
     assert found.warnings[0].startswith("points without GPS time (0 or NaN): 30;")
     (again,), _ = count_returns([tmp_path / "a.las"], held=5)
     assert again.by_count == found.by_count
-
-
-def test_buckets_and_pieces_change_nothing(tmp_path):
-    receiver = DiscreteReceiver(most=3)
-    simulate_returns("canopy.orion-22", tmp_path / "c.laz", pulses=3000, receiver=receiver)
-    whole = count_returns([tmp_path / "c.laz"])[1]
-    parts = count_returns([tmp_path / "c.laz"], held=500)[1]
-    assert parts.by_count == whole.by_count and parts.incomplete == whole.incomplete == 0
-    assert parts.separations["1-2"].least == whole.separations["1-2"].least
-    assert parts.separations["1-2"].mean == pytest.approx(whole.separations["1-2"].mean, rel=1e-12)
-    assert any(line.startswith("limit") for line in whole.warnings)
 
 
 @pytest.mark.parametrize(("deep", "limited"), [(1, False), (40, True)])
@@ -149,30 +126,6 @@ def test_counted_pulses_whose_points_are_missing_are_not_stored_twice(tmp_path):
     found = count_returns([write_cloud(tmp_path / "c.las", np.zeros(120), -2.0 * number, number, np.full(120, 2))])[1]
     assert found.incomplete and not any(line.startswith("crowded") for line in found.warnings)
     assert any(line.startswith("incomplete") for line in found.warnings)
-
-
-def test_total_is_the_sum_of_the_files(tmp_path):
-    path = write_cloud(tmp_path / "a.las", **SMALL)
-    other = write_cloud(tmp_path / "b.las", **SMALL, flags=[EchoFlag.WEAK] * 7)
-    total = count_returns([path, other])[1]
-    assert (total.points, total.pulses, total.incomplete) == (14, 8, 2)
-    assert total.flags["WEAK"] == 7
-    assert total.separations["1-2"].pairs == 4
-
-
-def test_clouds_without_pairs_and_without_points(tmp_path):
-    single = {name: values[3:4] for name, values in SMALL.items()}
-    found = count_returns([write_cloud(tmp_path / "c.las", **single)])[1]
-    assert found.separations["all"].pairs == 0 and found.warnings == ()
-    none = {name: values[:0] for name, values in SMALL.items()}
-    found = count_returns([write_cloud(tmp_path / "d.las", **none)])[1]
-    assert (found.points, found.pulses) == (0, 0) and math.isnan(found.returns_per_pulse)
-
-
-def test_real_file(riegl):
-    found = count_returns([riegl])[1]
-    assert (found.points, found.pulses) == (2535, 2368)
-    assert found.by_number[1] == pytest.approx(0.9329, abs=1e-4)
 
 
 def test_a_cloud_that_cannot_be_read_is_named_and_the_others_are_counted(tmp_path):
@@ -353,19 +306,6 @@ def test_polygons_first_come_and_what_is_outside(tmp_path):
     check_sum(one.areas, one)
 
 
-def test_cells_and_polygons_of_several_clouds(tmp_path):
-    for seed, name in enumerate("ab"):
-        make_cloud(tmp_path / f"{name}.las", seed=seed, east=300_000.0 + 50 * seed)
-    divisions = [AreaGrid(20), PolygonSet([square(300_000, -30, 100)])]
-    each, total = count_returns([tmp_path / "a.las", tmp_path / "b.las"], divisions=divisions)
-    for one in (*each, total):
-        for kinds in (("cell",), ("polygon", "outside")):
-            check_sum([area for area in one.areas if area.kind in kinds], one)
-    cells = {(area.x, area.y): area.pulses for area in total.areas if area.kind == "cell"}
-    for (x, y), pulses in cells.items():
-        assert pulses == sum(area.pulses for one in each for area in one.areas if (area.x, area.y) == (x, y))
-
-
 @pytest.mark.parametrize("scale", [float("nan"), 1e300, float("inf")])
 def test_damaged_coordinates_are_counted_outside(tmp_path, scale):
     make_cloud(tmp_path / "c.las", n=50)
@@ -407,19 +347,6 @@ def write_features(path, *features):
 
 def feature(kind, coordinates, **properties):
     return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
-
-
-def test_polygons_of_a_file(tmp_path):
-    ring = [[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]]
-    hole, other = [[2, 2], [4, 2], [4, 4], [2, 4], [2, 2]], [[20, 0, 7], [30, 0, 7], [30, 10, 7], [20, 0, 7]]
-    path = write_features(
-        tmp_path / "p.json", feature("Polygon", [ring, hole], name="lawn"), feature("MultiPolygon", [[ring], [other]])
-    )
-    lawn, two = load_polygons(path)
-    assert (lawn.name, two.name) == ("lawn", "2")
-    x, y = np.array([1.0, 3, 29, -1]), np.array([1.0, 3, 5, 1])
-    assert find_inside(lawn.rings, x, y).tolist() == [True, False, False, False]
-    assert find_inside(two.rings, x, y).tolist() == [True, True, True, False]
 
 
 def test_separations_by_rank_and_depth_of_pulses(tmp_path):

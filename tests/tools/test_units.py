@@ -5,15 +5,13 @@ import re
 import shutil
 import struct
 
-import numpy as np
 import pytest
 from commands import run_command
 from strips import add_record
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.las.crs import build_utm, metres_per_unit, parse_wkt
+from wavebatch.files.las.crs import build_utm
 from wavebatch.files.las.header import build_wkt
-from wavebatch.files.strip.packet_check import DirectionTally, decide_direction
 from wavebatch.tools.plots.charts import picture_cloud
 from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.simulate import simulate_strip
@@ -49,13 +47,6 @@ def _print(*words, code=0):
     result = run_command(*words)
     assert result.exit_code == code, result.output
     return result
-
-
-def test_units_of_a_crs():
-    assert metres_per_unit([]) == (1.0, 1.0, 1.0) == metres_per_unit([parse_wkt(build_utm(32633))])
-    assert metres_per_unit([parse_wkt(FEET)]) == pytest.approx((FOOT, FOOT, FOOT))
-    east, _, up = metres_per_unit([parse_wkt(DEGREES)])
-    assert east != east and up == 1.0
 
 
 def test_distances_of_returns_are_metres(clouds):
@@ -155,9 +146,3 @@ def test_geocentric_coordinates_have_no_height(clouds, tmp_path):
     found = measure_profile([cloud], "z", "count")
     assert found.upright == "z" and found.label.endswith(" m of z")
     assert "coordinates       geocentric (ECEF)" in _print("info", cloud).stdout
-
-
-def test_vectors_in_the_unit_of_the_coordinates_are_no_oddity():
-    tally = DirectionTally("stored", [10, 0], [10, 0], [np.full(10, 1 / FOOT)])
-    assert decide_direction(tally, "auto", FOOT).warnings == ()
-    assert "3.281 times c/2 long" in decide_direction(tally, "auto").warnings[0]

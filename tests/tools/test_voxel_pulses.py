@@ -10,7 +10,6 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.tools.voxels.rays import LOST, PACKET, SAMPLE, join_packets, read_batches
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 NOISE = ReceiverNoise(baseline=12.0, baseline_spread=0.1, std=0.58)
@@ -229,23 +228,6 @@ def test_times_of_many_packets_are_no_pulse(canopy, tmp_path):
         strip = write_recorded(tmp_path / f"{time}.las", *pulses, record(canopy[0], 4), time=np.full(N, time))
         summary, _ = voxelize(strip, tmp_path)
         assert summary.pulses == summary.waveforms > N and summary.several_packets == summary.lost_packets == 0
-
-
-def test_batches_hold_whole_pulses_and_stay_small(strips):
-    from wavebatch.files.strip.reader import StripReader
-
-    with StripReader(strips[1]) as reader, reader.scan() as scan:
-        seen = []
-        for batch in read_batches(reader, scan, block_size=50):
-            groups = np.concatenate([groups for _, _, groups, _ in batch.parts])
-            assert len(groups) <= 50 + 3
-            seen.append(np.unique(groups))
-        assert len(np.concatenate(seen)) == len(np.unique(np.concatenate(seen))) == N
-
-
-def test_packets_of_nothing_are_rays_of_nothing():
-    rays = join_packets(np.zeros(0, PACKET), np.zeros(0, SAMPLE), np.zeros(0, LOST))
-    assert len(rays.table) == len(rays.samples) == 0
 
 
 @pytest.mark.slow

@@ -68,13 +68,6 @@ def test_histograms_count_them(cloud, split):
     np.testing.assert_array_equal(found.counts, wanted.counts)
 
 
-def test_clouds_are_compared_at_them(cloud, split):
-    path, number, total = split
-    found = compare_clouds(cloud, path, chosen=CHOSEN)
-    assert (found.matched, found.missed, found.extra) == (number, 0, 0)
-    assert (found.left_out_a, found.left_out_b) == (total - number, 0)
-
-
 def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path):
     all_, some, rest = (
         voxelize_strip(tiny_strip, tmp_path / f"{number}.npz", VoxelOptions(2.0, chosen=PointFilter(where=where)))
@@ -86,11 +79,6 @@ def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path):
     # Returns of a pulse have one number of returns: both parts make the whole.
     assert some.waveforms + rest.waveforms == all_.waveforms
     assert some.energy + rest.energy == pytest.approx(all_.energy, rel=1e-6)
-
-
-def test_voxels_may_lack_any_waveform(tiny_strip, tmp_path):
-    found = voxelize_strip(tiny_strip, tmp_path / "x.npz", VoxelOptions(2.0, chosen=PointFilter.build(where="z > 1e6")))
-    assert (found.waveforms, found.voxels) == (0, 0) and found.left_out > 0
 
 
 def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
