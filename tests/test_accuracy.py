@@ -168,6 +168,18 @@ def test_clipped_echoes_are_unbiased(share, rms, bound):
     assert np.median(echoes.amplitude) == pytest.approx(400, rel=0.01)
 
 
+def test_edges_cost_what_the_bound_says():
+    """H8: the error of the time grows by 1.19 with the centre one sigma from the edge; errors are reported so."""
+    n = 6000
+    time = phases(n, 4, 2.0)
+    block = record(n, (50, time, SIGMA), seed=4)
+    echoes = alone(decompose("gaussian", block), n)
+    assert len(echoes) > 0.99 * n
+    scaled = (echoes.time - time[echoes.waveform]) / echoes.time_err
+    assert np.std(scaled) == pytest.approx(1, abs=0.1)
+    assert np.median(echoes.time_err) / crlb(50 * STD, SIGMA, STD, 1.0)[0] == pytest.approx(1.19, abs=0.06)
+
+
 def run_scene(scene, profile, n=8192):
     """Errors are those of the fit: what hidden neighbours add is in surveying/test_hidden_neighbours.py."""
     block, truth = simulate_block(scene, n, np.random.default_rng(11))

@@ -93,6 +93,14 @@ def test_run_has_the_options_of_runoptions_and_python_the_same():
     assert names.keys() - OPTIONS.keys() == extra and keywords.keys() - OPTIONS.keys() == {"strips", "on_event"}
 
 
+def test_help_of_run_begins_with_the_options_that_most_need():
+    shown = invoke("run", "--help").stdout
+    headings = re.findall(r"(?m)^([A-Z][\w ]+):\n  -", shown)
+    assert headings[0] == "Options that most runs need"
+    first = shown.split(headings[0])[1].split(f"\n{headings[1]}:")[0]
+    assert len(re.findall(r"(?m)^  (?:-\w, )?--", first)) <= 11 and "--jobs" in first and "--crs" not in first
+
+
 @pytest.mark.parametrize(
     ("variable", "words"),
     [

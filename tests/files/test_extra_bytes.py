@@ -28,6 +28,15 @@ def test_laspy_reads_what_we_declare(dtype):
     assert bare.declared_range is None and not as_laspy(bare).min_is_relevant()
 
 
+@pytest.mark.parametrize("code", range(1, 31))
+def test_every_type_of_the_specification(code):
+    record = ExtraRecord(bytes([0, 0, code]) + bytes(189))
+    assert record.dtype == as_laspy(record).dtype()
+    length = (code - 1) // 10 + 1
+    no_data = record.with_no_data(np.arange(length) + 1).no_data
+    assert list(no_data) == list(range(1, length + 1))
+
+
 def test_texts_longer_than_the_record_are_refused():
     with pytest.raises(ValueError, match="32 bytes"):
         ExtraRecord.build("n" * 33, "f4", "")

@@ -9,6 +9,28 @@ from wavebatch.kernels.fit.closed_form import fit_closed_form
 from wavebatch.stages.decompose.fit import closed_form
 
 VECTOR = 37.5 * np.exp(-0.5 * ((np.arange(31) - 14.3) / 1.8) ** 2)
+PEAK = 14
+
+
+def windows(y, reach=12):
+    return y[None, PEAK - reach : PEAK + reach + 1]
+
+
+def test_a_gaussian_is_found_exactly():
+    amplitude, time, width, holds = fit_closed_form(windows(VECTOR), 0.2)
+    assert holds.all()
+    assert amplitude[0] == pytest.approx(37.5, rel=1e-12)
+    assert time[0] + PEAK == pytest.approx(14.3, rel=1e-12)
+    assert width[0] == pytest.approx(1.8, rel=1e-12)
+
+
+def test_rounded_gaussian_gives_the_published_numbers():
+    amplitude, time, width, _ = fit_closed_form(windows(np.rint(VECTOR)), 0.2)
+    assert amplitude[0] == pytest.approx(37.6073, abs=5e-5)
+    assert time[0] + PEAK == pytest.approx(14.28882, abs=5e-6)
+    assert width[0] == pytest.approx(1.80415, abs=5e-6)
+
+
 @pytest.mark.parametrize(("steps", "tolerance"), [(2, 2e-5), (30, 1e-5)])
 def test_steps_lead_to_the_published_least_squares(steps, tolerance):
     """Two Gauss-Newton steps after the closed form, and the minimum itself."""

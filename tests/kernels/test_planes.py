@@ -200,6 +200,16 @@ def test_reasons():
     assert np.nanmedian(angle) == pytest.approx(np.degrees(np.arctan(0.2)), abs=0.1)
 
 
+def test_dense_points_are_thinned_alike_whatever_else_is_there(rng):
+    xyz, row = rng.uniform(0, 4, (20_000, 3)), np.arange(20_000)
+    kept = normals.thin_out(xyz, row, 1.0)
+    cells, number = np.unique(np.floor(xyz[kept] / 0.25), axis=0, return_counts=True)
+    assert number.max() == normals.MOST_PER_CELL and len(cells) == len(np.unique(np.floor(xyz / 0.25), axis=0))
+    part = np.flatnonzero(xyz[:, 0] < 2.0)
+    np.testing.assert_array_equal(normals.thin_out(xyz[part], row[part], 1.0), kept[part])
+    assert normals.thin_out(xyz[:200], row[:200], 0.1).all()
+
+
 def test_every_point_lies_in_one_tile_and_its_neighbours_are_listed(rng):
     xyz = np.concatenate([rng.uniform(0, 100, (4000, 3)), rng.normal(50, 0.5, (2000, 3)), [[1e7, -1e7, 0]]])
     xyz[:500, 0] = 10.0

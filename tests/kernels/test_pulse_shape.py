@@ -44,6 +44,13 @@ def test_derivatives_equal_differences(shape):
         np.testing.assert_allclose(by_width, s * plain[:, 1], atol=5e-6)
 
 
+def test_single_precision_is_close_to_double(shape):
+    x = np.arange(40.0)
+    for single, double in zip(evaluate(shape, x, 17.3, 2.1, np.float32), evaluate(shape, x, 17.3, 2.1), strict=True):
+        assert single.dtype == np.float32
+        np.testing.assert_allclose(single, double, atol=2e-5)
+
+
 @pytest.mark.parametrize("kappa", [1e-2, 1e-3, 1e-4, -1e-3])
 def test_skew_moves_a_gaussian_by_0_580_of_its_size(kappa):
     """max |z^3| exp(-z^2/2) / 2 = 0.5797 at z = sqrt(3); the 0.548 of docs/algorithms.md H4 is too small."""

@@ -3,6 +3,7 @@
 import naive
 import numpy as np
 import pytest
+from published import PULSE_SIGMA
 
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import (
@@ -13,6 +14,7 @@ from wavebatch.kernels.fit.pulse_shape import (
 )
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.decompose.models import rebuild_waveforms
+from wavebatch.stages.pulse_tables import ShapeLimits, model_parameters
 
 FINE = 100.0
 """Counts per unit of amplitude."""
@@ -28,6 +30,13 @@ def record(y, spacing=1.0, std=1.0):
 def decompose(name, block, noise, system, **parameters):
     candidates = STAGES["detect.maximum"].function(block, noise, system)
     return STAGES[f"decompose.{name}"].function(block, noise, system, candidates, **parameters)
+
+
+def place_peaks(kappa, ref, echoes):
+    """Times of the peaks of skewed echoes, whose times are those of their datum [samples]."""
+    shape, limits = PulseShape(kappa=kappa), ShapeLimits(ref, 0.7 * ref, 4 * ref)
+    whole = np.stack([echoes.amplitude, echoes.time, echoes.sigma], axis=1).astype(float)
+    return model_parameters(shape, limits, whole)[:, 1]
 
 
 def evaluate(shape, x, t, s):
@@ -54,6 +63,29 @@ def test_tabulated_pulses_and_their_derivatives():
 
 WANG = [(0.104, 0.0214, 0.0089, 0.0069), (0.184, 0.0158, 0.0100, 0.0037), (0, 0.0097, 0.0014, 0.0014)]
 WANG += [(0.05, 0.0186, 0.0058, 0.0052)]
+
+
+@pytest.mark.parametrize(("kappa", "noise_share", "gaussian", "log_normal"), WANG)
+def test_goodness_of_fit_of_wang(kappa, noise_share, gaussian, log_normal):
+    """T7: E = |f - y|^2 / |f|^2 of Gaussian and log-normal fits to 60 samples, FWHM 5 ns, within 10 %."""
+    n, x, sigma = 400, np.arange(60.0), PULSE_SIGMA
+    rng = np.random.default_rng(int(1e4 * noise_share))
+    time = 30 + rng.uniform(-0.5, 0.5, n)
+    std = 100 * noise_share
+    y = np.stack([100 * naive.pulse(x, t, sigma, kappa) for t in time]) + std * rng.standard_normal((n, 60))
+    block, noise = record(y, std=std)
+    system = SystemPulse(sigma, kappa=kappa)
+    for name, published in (("gaussian", gaussian), ("skewed", log_normal)):
+        found = decompose(name, block, noise, system)
+        alone = found.take(found.count(n)[found.waveform] == 1)
+        assert len(alone) > 0.95 * n
+        skew = kappa if name == "skewed" else 0
+        ratios = []
+        for echo in range(len(alone)):
+            peak = place_peaks(skew, sigma, alone)[echo]
+            f = alone.amplitude[echo] / FINE * naive.pulse(x, peak, alone.sigma[echo], skew)
+            ratios.append(np.sum((f - y[alone.waveform[echo]]) ** 2) / np.sum(f**2))
+        assert np.mean(ratios) == pytest.approx(published, rel=0.10), name
 
 
 @pytest.mark.parametrize("model", ["broadened", "stretched", "given"])

@@ -10,6 +10,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.text_file import write_text
+from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey, survey_block, survey_blocks
@@ -101,6 +102,16 @@ def test_widened_echoes_of_skewed_pulses_stay_whole(mirror):
     block, time, _ = record(lambda x: skewed(mirror * x), 6, n=4000, amplitude=(30, 200), wide=0.4)
     _, _, whole, _ = judge(block, time)
     assert whole > 0.98
+
+
+def test_half_widths_of_any_sum_rise_with_its_width():
+    """Two Gaussians with a dip between them: narrower ones have a lower peak and therefore a larger half width."""
+    lobes = ((0.86, 1.92, -0.33), (0.6, -1.54, -0.55), (-0.17, 3.23, -0.83), (-0.13, -2.65, -0.9))
+    shape = PulseShape(components=lobes)
+    table = measure_pulse(shape, 0.985, 4.7)
+    assert (np.diff(table.half_width) > 0).all()
+    plain = measure_pulse(PulseShape(components=((0.1, 5.0, 1.0),)), 0.7, 4.0)
+    assert plain.half_width == pytest.approx(2.354820 * plain.width, rel=0.05)
 
 
 def drifting(seed, *, drift, noise, n=3000, top=200):

@@ -1,4 +1,4 @@
-"""Chains against chains, clouds and the vendor's returns on one strip: loops, known truth, Wagner's tables (T6).
+"""Chains against chains and clouds on one strip: loops, known truth, Wagner's tables (T6).
 
 Goodness of fit against loops, Wang's tables (T7), and the model of every decomposer.
 """
@@ -242,3 +242,12 @@ def test_the_floor_is_that_of_single_samples_where_noise_is_coloured():
     system = SystemPulse(2.0, noise=ReceiverNoise(std=1.6, by_kind={"quiet": 0.8}))
     coloured = measure_fit(block, noise, system, step, echo)[1]
     assert coloured == pytest.approx(plain / 4, rel=1e-5)
+
+
+def test_floor_of_the_specification():
+    """0.00159 for 60 samples, amplitude over noise 100, sigma 2.123."""
+    block, noise = record(100 * naive.pulse(np.arange(60.0), 30.0, 2.123)[None], std=1.0)
+    echo = EchoTable.build(np.zeros(1), np.array([30.0]), np.array([100 * FINE]), np.array([2.123]))
+    misfit, floor = measure_fit(block, noise, SystemPulse(2.123), Step(STAGES["decompose.gaussian"]), echo)
+    assert floor[0] == pytest.approx(0.00159, abs=1e-5)
+    assert misfit[0] < 1e-6

@@ -1,7 +1,4 @@
-"""`wavebatch synthesize`: the strip holds the cloud, and `run` finds its returns again.
-
-Waveforms with echoes that are given: samples, truth, noise as it is.
-"""
+"""`wavebatch synthesize`: the strip holds the cloud, and `run` finds its returns again."""
 
 import json
 

@@ -121,6 +121,20 @@ def test_bits_windows_and_spacings(bits, dtype):
     assert truth.time.max() > 80
 
 
+@pytest.mark.parametrize("terrain", list(render.TERRAINS))
+def test_rays_and_slopes_fit_together(terrain):
+    rays = render.trace_rays(render.FlightLine(), terrain, np.arange(0, 50_000, 7))
+    assert np.allclose(np.linalg.norm(rays.direction, axis=1), render.AIR_SPEED)
+    assert (rays.direction[:, 2] < 0).all()
+    assert (np.diff(rays.gps_time) > 0).all()
+    assert np.abs(rays.scan_angle).max() <= 30
+    height, slope_x, slope_y = render.TERRAINS[terrain](rays.ground[:, 0], rays.ground[:, 1])
+    ahead = render.TERRAINS[terrain](rays.ground[:, 0] + 1e-4, rays.ground[:, 1])[0]
+    aside = render.TERRAINS[terrain](rays.ground[:, 0], rays.ground[:, 1] + 1e-4)[0]
+    assert np.median(np.abs((ahead - height) / 1e-4 - slope_x)) < 1e-3
+    assert np.median(np.abs((aside - height) / 1e-4 - slope_y)) < 1e-3
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"rho": 0.3}, {"rho": 1.0}, {"rho": 2.0}, {"rho": -1.0}, {"saturation": 300}, {"spacing": 0.01},
