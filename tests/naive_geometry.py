@@ -6,6 +6,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 
+def group_times(gps_time, longest=64):
+    """First row of equal time of each packet; rows of a time of many packets, or of time 0 or NaN, are alone."""
+    times = [float(time) for time in gps_time]
+    alone = [not time or time != time or times.count(time) >= longest for time in times]
+    return [row if alone[row] else times.index(time) for row, time in enumerate(times)]
+
+
 def find_rays(group, scanner, start, step, aligned=1e-4, beside=0.1):
     """First row of the ray of each packet: of one group and scanner, of one direction, on one line."""
     heads = []

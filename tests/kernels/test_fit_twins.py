@@ -33,6 +33,23 @@ def test_equations_are_solved_as_by_numpy(rng, size):
         np.testing.assert_allclose(solve(matrix, wanted), np.linalg.solve(matrix, wanted), rtol=1e-5)
 
 
+def test_moments_of_residuals_are_those_of_the_twin(rng):
+    """Also of echoes at the ends of the waveform, and narrower or wider than it."""
+    s = 60
+    residual = rng.normal(0, 2, (30, s)).astype(np.float32)
+    time, width = rng.uniform(-2, s + 2, 30), rng.uniform(0.6, 5, 30)
+    width[:2] = 40.0
+
+    def read(rows, at):
+        return np.take_along_axis(residual[rows], at, axis=1)
+
+    h3, h4 = pulse_shape.residual_moments(read, s, time, width, np.full(30, 2.0))
+    x = np.arange(float(s))
+    for row in range(30):
+        expected = naive_fit.moments(np.array([[1.0], [time[row]], [width[row]]]), x, residual[row].astype(float), 2.0)
+        assert (h3[row], h4[row]) == pytest.approx((expected[0][0], expected[1][0]), abs=0.02)
+
+
 @pytest.mark.parametrize("s", [40, 1300])
 @pytest.mark.parametrize(
     "shape", [{}, {"kappa": 0.2}, {"components": ((0.3, 4.0, 2.0), (-0.1, 9.0, 0.5))}], ids=["gauss", "skewed", "sum"]

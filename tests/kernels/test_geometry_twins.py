@@ -5,9 +5,18 @@ import numpy as np
 
 from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.group_returns import (
+    LONGEST_PULSE,
     find_rays,
+    group_times,
 )
 from wavebatch.kernels.geometry.normals import thin_out
+
+
+def test_packets_of_equal_time_are_those_of_a_loop(rng):
+    time = np.concatenate([rng.integers(0, 40, 120).astype(float), np.full(LONGEST_PULSE, 77.0), [np.nan] * 3])
+    rng.shuffle(time)
+    assert group_times(time).tolist() == naive_geometry.group_times(time)
+    assert group_times(time[:0]).tolist() == []
 
 
 def test_packets_of_a_pulse_lie_on_one_line(rng):

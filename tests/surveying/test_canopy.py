@@ -121,6 +121,23 @@ def test_an_echo_found_with_every_strong_one_is_a_part_of_the_pulse(scene):
         assert not tail
 
 
+@pytest.mark.parametrize(("more", "is_tail"), [(0.0, True), (0.0015, False)])
+def test_what_weaker_echoes_have_more_of_is_no_tail_where_most_have_a_neighbour(more, is_tail):
+    """By 2.4 errors of the lowest shares; 1.25 are chance."""
+    rng, n, x = np.random.default_rng(1), 400, np.arange(120.0)
+    weaker = np.arange(n) % 2 == 1
+    height, time = np.where(weaker, rng.uniform(300, 400, n), rng.uniform(900, 1000, n)), rng.uniform(30, 40, n)
+    neighbour = np.where(rng.random(n) < 0.7, rng.uniform(0.02, 0.12, n), 0.0)
+    signal = sum(
+        one[:, None] * np.exp(-0.5 * ((x - at[:, None]) / 2) ** 2)
+        for one, at in ((height, time), (height * (0.04 + neighbour + more * weaker), time + 16.0))
+    )
+    block = WaveformBlock.from_samples(np.rint(20 + signal + rng.standard_normal((n, 120))).astype(np.uint16))
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=20.0, std=1.0, by_kind={"quiet": 1.0}))
+    clear = EchoTable.build(np.arange(n), time, height, np.full(n, 2.0))
+    assert (16.0 in dict(measure_tail(block, system, clear).tail_misfit)) == is_tail
+
+
 @pytest.mark.parametrize(("alone", "raised"), [(1.0, False), (3.0, True)])
 def test_fits_of_echoes_alone_decide_whether_the_misfit_is_raised(alone, raised):
     """Close neighbours that are not found are left of the others too."""

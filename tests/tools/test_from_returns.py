@@ -71,6 +71,16 @@ def test_samples_are_gaussians_at_the_returns(cloud, tmp_path):
     assert len(lengths) > 1
 
 
+def test_lone_returns_take_the_direction_of_their_scan_angle(cloud, tmp_path):
+    synthesize_strip(cloud, tmp_path / "s.las")
+    points = read_cloud(tmp_path / "s.las")[0]
+    lone = points["bit_fields"] >> 3 & 7 == 1
+    y, z = points["y_t"][lone], points["z_t"][lone]
+    assert lone.sum() > 100
+    assert -y / z == pytest.approx(np.tan(np.radians(points["scan_angle_rank"][lone])), abs=0.03)
+    assert points["x_t"][lone] / z == pytest.approx(np.full(lone.sum(), -4 / 57.3), abs=0.02)
+
+
 def test_measured_widths_come_first(cloud, tmp_path):
     synthesize_strip(cloud, tmp_path / "s.las", SynthesisOptions(width=8.0, bits=16, gain=5.0))
     run_one(tmp_path / "s.las", tmp_path / "out", profile="balanced")
