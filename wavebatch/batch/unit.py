@@ -9,6 +9,7 @@ Before you change it: all that travels between processes must be picklable, and 
 from __future__ import annotations
 
 import functools
+import math
 import pickle
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -40,7 +41,13 @@ from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import ChainChoice, try_chain, without_columns
-from wavebatch.surveying.flat_ground import angle_parameters, choose_radius, measure_slope, sample_reference
+from wavebatch.surveying.flat_ground import (
+    GroundReference,
+    angle_parameters,
+    choose_radius,
+    measure_slope,
+    sample_reference,
+)
 from wavebatch.surveying.matching.setting import doubt_zone
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorSource, judge_scale, refuse_units
@@ -210,18 +217,24 @@ def _see_level(
     """The choice with the widths of surfaces that face the sensor, where angles are computed and no saved survey has
     them; and what is doubtful about the beam."""
     parameters = angle_parameters(job.chain)
-    survey = choice.survey
-    saved = job.request.system is not None and not job.request.flight and survey.system.widths.error is not None
-    if parameters is None or sensor.kind == UNKNOWN.kind or saved:
+    survey, figures = choice.survey, choice.survey.figures
+    if parameters is None or sensor.kind == UNKNOWN.kind:
         return choice, ()
     used = job.calibrate(survey.system)
     divergence = parameters["divergence"] or used.radiometry.divergence
     used = used.with_radiometry(divergence=divergence)
-    seen = sample_reference(reader, scan, sensor, used, survey.figures.spacing_ns or 0.0)
+    if job.request.system is not None and not job.request.flight and survey.system.widths.error is not None:
+        beam = figures.divergence_seen_mrad
+        seen = GroundReference(used, 0, beam, (figures.divergence_seen_error_mrad or 0.0) / (beam or 1.0))
+    else:
+        seen = sample_reference(reader, scan, sensor, used, figures.spacing_ns or 0.0)
     doubt = seen.doubt()
     error = survey.system.radiometry.divergence_error
     if doubt and seen.divergence and divergence:
-        error = abs(seen.divergence / divergence - 1.0)
+        # Cross sections go with the square, so that a beam twice as wide makes them four times as large, not three.
+        ratio = seen.divergence / divergence
+        ratio *= 1.0 + math.copysign(seen.divergence_error, ratio - 1.0)
+        error = abs(ratio - 1.0) * max(1.0, 0.5 * (ratio + 1.0))
     system = _take_reference(survey.system, seen.system).with_radiometry(divergence_error=error)
     return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()
 
