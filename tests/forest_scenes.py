@@ -66,8 +66,11 @@ def grow(rng, side, *, crowns, density, slope=0.0):
     return Leaves(place, normal / np.linalg.norm(normal, axis=1)[:, None], slope)
 
 
-def fly(path, rng, leaves, side, *, pulses=8.0, angle=0.0, footprint=0.3, split=False, rays=20):
-    """A strip over the plot; `pulses` per m2, all at `angle` [deg] off the vertical, `split` into several packets."""
+def fly(path, rng, leaves, side, *, pulses=8.0, angle=0.0, footprint=0.3, split=False, rays=20, light=900.0):
+    """A strip over the plot; `pulses` per m2, all at `angle` [deg] off the vertical, `split` into several packets.
+
+    light: height of the echo of a white surface [count]; the noise is 0.6.
+    """
     direction = np.array([np.sin(np.radians(angle)), 0.0, -np.cos(np.radians(angle))])
     n = int(pulses * (side + 2 * EDGE) ** 2)
     aim = rng.uniform(-EDGE, side + EDGE, (n, 2))  # where the middle of a pulse meets the height of 108 m
@@ -80,7 +83,7 @@ def fly(path, rng, leaves, side, *, pulses=8.0, angle=0.0, footprint=0.3, split=
     high = (centre[:, 2] + 26.0 + rng.uniform(0, 0.3, n) - centre[:, 2]) / -direction[2]  # back to the first sample [m]
     begin = centre - high[:, None] * direction
     pulse = np.repeat(np.arange(n), rays)
-    energy = 900.0 * np.exp(0.05 * rng.standard_normal(n))[pulse] / rays
+    energy = light * np.exp(0.05 * rng.standard_normal(n))[pulse] / rays
     amplitude = energy * np.where(hit, LEAF, SOIL)
     distance = (high[:, None] + way).ravel()
     top = np.full(n, 1000.0)

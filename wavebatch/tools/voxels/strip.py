@@ -224,7 +224,12 @@ def voxelize_strip(
         batches = rays.read_batches(
             reader, scan, numbers=numbers.tolist(), choose=lambda rows: rows[even_places(len(rows), each)]
         )
-        rule = rays.find_rule(map(tracer.trace, batches), options.reflectance_ratio)
+        sample, louder, rng = [], [], np.random.default_rng(0)
+        for batch in batches:
+            sample.append(tracer.trace(batch))
+            louder.append(tracer.trace(batch, rng))
+        rule = rays.find_rule(sample, options.reflectance_ratio)
+        rule = rays.hold_lost(rule, sample, louder, options.reflectance_ratio)
         most_bits = max(digitizer.bits for digitizer in reader.facts.digitizers.values() if digitizer.n_samples)
         with (
             voxel_grid.VoxelGrid(
@@ -338,8 +343,8 @@ class _Tracer:
     energy: PulseEnergy | None
     sections: bool
 
-    def trace(self, batch: rays.Batch) -> rays.Rays:
-        """The rays of the pulses of a batch that `--where` keeps."""
+    def trace(self, batch: rays.Batch, louder: np.random.Generator | None = None) -> rays.Rays:
+        """The rays of the pulses of a batch that `--where` keeps; louder: as for `rays.deconvolve_block`."""
         packets, samples = [np.empty(0, rays.PACKET)], [np.empty(0, rays.SAMPLE)]
         number = 0
         for unit, rows, groups, kept in batch.parts:
@@ -347,7 +352,7 @@ class _Tracer:
             place[rows] = np.arange(len(rows))
             for block, index in self.reader.read_rows(unit, rows, max(len(rows), 1)):
                 block = self.sensor.fill(block if self.energy is None else self.energy.fill(block, unit))
-                profiles = rays.deconvolve_block(block, self.pulse, self.options.deconvolution)
+                profiles = rays.deconvolve_block(block, self.pulse, self.options.deconvolution, louder)
                 if block.pulse_energy is not None:
                     known = np.isfinite(block.pulse_energy)
                     scale = np.where(known, block.pulse_energy, 1.0)[:, None]
