@@ -44,6 +44,13 @@ def folder(tmp_path_factory):
     return folder
 
 
+def test_a_survey_that_is_only_shown_looks_for_no_other_strips(folder):
+    shown = survey(folder / "flat.las", for_checks=False)
+    assert shown.figures.look is None and not shown.figures.kinds
+    saved = load_survey(folder / "SYSTEM.toml").survey
+    assert saved.figures.look is not None and shown.system.sigma_ref == pytest.approx(saved.system.sigma_ref)
+
+
 def contradiction(strip, saved):
     with StripReader(strip) as reader, reader.scan() as scan:
         reason, sure = find_contradiction(reader, scan, saved)

@@ -80,7 +80,8 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
         check_angles(angles, overwrite=overwrite)
-    saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
+    keeps = bool(output or html_file or options["as_json"])
+    saved, facts = _survey(paths[0], options, keeps=keeps) if len(paths) == 1 else _survey_together(paths, options)
     survey = saved.survey
     if output is not None:
         write_text(output, format_survey(saved), overwrite=overwrite)
@@ -118,8 +119,8 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
         sys.exit(EXIT_PROBLEMS)
 
 
-def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
-    """The survey, and what else is shown of the strip."""
+def _survey(strip: Path, options: dict[str, Any], *, keeps: bool) -> tuple[SavedSurvey, dict[str, Any]]:
+    """The survey, and what else is shown of the strip; keeps: all of its figures are, not only printed ones."""
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
     from wavebatch.surveying.system_file import SavedSurvey
@@ -127,8 +128,9 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
 
     with api.open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
         found = api.survey(
-            opened, waveforms=options["waveforms"], divergence=options["divergence"], find_divergence=True
-        )
+            opened, waveforms=options["waveforms"], divergence=options["divergence"], find_divergence=True,
+            for_checks=keeps,
+        )  # fmt: skip
         scan = opened.scan
         facts = {
             "strip": str(opened.facts.path),
