@@ -103,17 +103,6 @@ def test_the_same_bytes_for_any_jobs_and_blocks(strips, clouds, tmp_path, batch)
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_returns_and_other_names(strips, clouds, tmp_path):
-    report = run_strip(strips / "urban.las", tmp_path, points="returns", names="pdal", format="las")
-    cloud = laspy.read(tmp_path / "urban.las")
-    angle = np.asarray(cloud["IncidenceAngleNormals"])
-    counts = report.no_data["incidence_angle_normals"]
-    assert counts["KNOWN"] == (angle != -9999).sum() > 0.7 * len(cloud)
-    assert counts["NO_RAY"] == report.count("added_echoes") > 0
-    vendor = laspy.read(strips / "urban.las")
-    np.testing.assert_array_equal(cloud.X, vendor.X)
-
-
 def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Twice the angle."""
     assert block.samples.shape == (len(block), 0) or np.isnan(echoes.attributes[COLUMNS[0]]).all()

@@ -157,15 +157,6 @@ def find_keep_mask(las, text):
     return condition.choose(values)
 
 
-def test_returns_keep_the_numbers_of_the_input(riegl, tmp_path):
-    las = laspy.read(riegl)
-    some, report = _run(riegl, tmp_path, points="returns", where="number_of_returns == 2", drop_flags="NO_ECHO,WEAK")
-    assert set(np.asarray(some.number_of_returns)) == {2}
-    counts = report["counts"]
-    assert counts["points_out"] + sum(counts["left_out"].values()) == len(las.points)
-    assert counts["left_out"]["drop_flags"] > 0
-
-
 def test_columns_of_a_second_pass_decide_after_it(riegl, tmp_path):
     """Normals are those of all points; selection comes after them."""
     columns = "+incidence_angle_normals"

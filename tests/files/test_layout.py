@@ -45,14 +45,6 @@ def test_promotion_keeps_every_field(tmp_path, old, new):
         np.testing.assert_array_equal(after["overlap"], before["classification"] == 12)
 
 
-def test_scan_angle_of_every_rank(tmp_path):
-    points = write_source(tmp_path / "a.las", 4, (1, 3), n=256)
-    points["scan_angle_rank"] = np.arange(-128, 128)
-    rows = plan_output(tmp_path / "a.las", [], point_format=6).rows(points)
-    assert np.all(np.abs(rows["scan_angle"] * 0.006 - points["scan_angle_rank"]) <= 0.003)
-    assert rows["scan_angle"][128 + 15] == 2500
-
-
 @pytest.mark.parametrize(("old", "new", "keep"), [(5, 6, 0), (10, 7, 0), (9, 1, 0), (4, 9, 0), (4, 6, 1)])
 def test_ways_that_lose_something_are_refused(tmp_path, old, new, keep):
     write_source(tmp_path / "a.las", old, VERSIONS[old])

@@ -179,21 +179,6 @@ def test_a_packet_longer_than_the_descriptor_is_cut_to_it(tmp_path):
     assert all(len(samples) == 32 for samples, *_ in read_all(raw.write(tmp_path / "a.las")).values())
 
 
-def test_several_descriptors_in_one_file(tmp_path):
-    first, second = make_raw(20, seed=1), make_raw(20, seed=2, bits=16, n_samples=50)
-    first.packets += second.packets
-    second.points["wavepacket_index"] = 7
-    second.points["wavepacket_offset"] += 20 * 32
-    second.points["gps_time"] += 1
-    first.points = np.concatenate([first.points, second.points])
-    unused = [descriptor(index, samples=0, spacing=0) for index in (2, 3, 200)]
-    first.vlrs = [descriptor(7, bits=16, samples=50, gain=0), *unused, first.vlrs[0]]
-    found = read_all(first.write(tmp_path / "a.las"))
-    assert_same(found, read_plainly(first.points, bytes(60) + first.packets, {1: (8, 32), 7: (16, 50)}))
-    with StripReader(tmp_path / "a.las") as reader:
-        assert sorted(reader.facts.digitizers) == [1, 2, 3, 7, 200]
-
-
 def test_equal_offsets_of_two_descriptors_are_two_packets(tmp_path):
     raw = make_raw(10, most_returns=1)
     raw.points = np.repeat(raw.points, 2)

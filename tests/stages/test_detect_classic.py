@@ -32,14 +32,6 @@ def test_isolated_echoes_are_found_at_their_peak(name, parameters, off):
         np.testing.assert_allclose(found.amplitude, 100 * amplitude, rtol=0.15)
 
 
-def test_the_edge_itself_walks_with_the_amplitude():
-    block, noise = record(2, ([20.0, 200.0], 40.0), std=0.0)
-    edge = detect("threshold", block, noise, correct_walk=False).time
-    wide = np.sqrt(SIGMA**2 + 0.5)
-    trigger = 4 * np.sqrt(6) / 4 / (np.array([20, 200]) * SIGMA / wide)
-    np.testing.assert_allclose(edge, 40 - wide * np.sqrt(-2 * np.log(trigger)), atol=0.13)
-
-
 @pytest.mark.parametrize("fraction", [0.0, 1.0])
 def test_a_fraction_must_be_one(fraction):
     block, noise = record(1, (20, [40.0]))

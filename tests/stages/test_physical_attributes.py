@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.no_data import NoData, count_reasons
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, Radiometry, ReceiverNoise, SystemPulse, WaveformBlock
-from wavebatch.files.cloud.column_names import describe
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
@@ -130,14 +128,6 @@ def test_a_reflectance_without_a_stage_for_its_angle_is_refused():
         Chain((*steps[:-1], Step(STAGES["attribute.reflectance"], {"surface": "echo"})), "mine")
 
 
-def test_level_ground_is_struck_at_the_angle_of_the_ray():
-    block, echoes, _ = make(np.full(4, 30.0))
-    slanted = np.tile([0.0, np.sin(np.pi / 3), -np.cos(np.pi / 3)], (4, 1)) * HALF_C
-    slanting = replace(block, direction=slanted)
-    done = run(slanting, echoes, SYSTEM, "backscatter_coefficient", "level_reflectance").attributes
-    assert done["level_reflectance"] == pytest.approx(done["backscatter_coefficient"] / 2, rel=1e-5)
-
-
 @pytest.mark.parametrize("tilt", [0.0, 25.0])
 def test_the_error_of_a_level_reflectance_is_what_unknown_slopes_do(tilt):
     """Surfaces of 30 degrees in any direction, struck at `tilt` to the vertical: root mean square of the deviation."""
@@ -153,16 +143,6 @@ def test_the_error_of_a_level_reflectance_is_what_unknown_slopes_do(tilt):
     assert done["level_reflectance_err"] / done["level_reflectance"] == pytest.approx(expected, rel=0.01)
     exact = run(slanting, echoes, SYSTEM, "level_reflectance", level_reflectance={"slope": 0.0}).attributes
     assert (exact["level_reflectance_err"] < 1e-3 * exact["level_reflectance"]).all()
-
-
-def test_only_echoes_alone_have_a_reflectance_and_an_angle():
-    block, echoes, _ = make(np.full(40, 30.0), per_waveform=2)
-    done = run(block, echoes, SYSTEM, *NAMES).attributes
-    assert np.isnan(done["level_reflectance"]).all() and np.isnan(done["level_reflectance_err"]).all()
-    assert np.isnan(done["incidence_angle"]).all()
-    assert np.isfinite(done["cross_section"]).all()
-    done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"alone": False}).attributes
-    assert np.isfinite(done["incidence_angle"]).all()
 
 
 @pytest.mark.parametrize(
@@ -194,16 +174,6 @@ def test_light_of_fits_at_a_bound_is_an_estimate_for_sums_and_no_reflectance():
         assert "reflectance" in name or (relative[0] > 0.5 and relative[1] < 0.1)
         bound = {"KNOWN": 2, "UNSETTLED": 1} if "reflectance" in name else {"KNOWN": 3}
         assert reasons(done)[name] == bound
-
-
-def test_angles_of_a_village_and_their_errors():
-    rng = np.random.default_rng(5)
-    true = rng.choice([10.0, 20, 30, 40, 50, 60], 20_000)
-    block, echoes, _ = make(true, snr=100.0)
-    done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"max_error": 90.0}).attributes
-    off, error = done["incidence_angle"] - true, done["incidence_angle_err"]
-    assert np.median(np.abs(off)) == pytest.approx(np.median(0.6745 * error), rel=0.2)
-    assert np.mean(np.abs(off) < error) == pytest.approx(0.683, abs=0.05)
 
 
 def test_modes_agree_where_they_should():
@@ -252,24 +222,6 @@ def test_echoes_that_are_far_too_narrow_are_flagged():
     done = run(block, echoes, SYSTEM, "incidence_angle")
     assert ((done.flags & np.uint16(EchoFlag.NARROW)) != 0).tolist() == [False, False, True]
     assert done.attributes["incidence_angle"].tolist() == [0.0, 0.0, 0.0]
-
-
-def test_relative_columns_need_no_calibration_and_become_absolute_with_its_constant():
-    block, echoes, _ = make(np.full(200, 30.0), snr=300.0)
-    bare = SYSTEM.with_radiometry(constant=None, divergence=None)
-    names = ("relative_backscatter", "relative_cross_section", "relative_reflectance")
-    others = ("backscatter_coefficient", "cross_section", "reflectance")
-    angles = run(block, echoes, SYSTEM, "incidence_angle")
-    by_echo = {"surface": "echo"}
-    relative = run(block, angles, bare, *names, relative_reflectance=by_echo).attributes
-    absolute = run(block, angles, SYSTEM, *others, reflectance=by_echo).attributes
-    area = np.pi / 4 * 1.1e-3**2
-    for name, other, factor in zip(names, others, (1.0, area, 1.0), strict=True):
-        assert relative[name] * 2.6e-8 * factor == pytest.approx(absolute[other], rel=1e-5)
-        assert relative[f"{name}_err"] * 2.6e-8 * factor == pytest.approx(absolute[f"{other}_err"], rel=1e-5)
-        column = COLUMNS_TABLE[name]
-        assert "relative" in name and "not calibrated" in column.meaning and "DN" in column.unit
-        assert "relative" in describe(column)
 
 
 def test_channels_have_constants_of_their_own():

@@ -1,14 +1,11 @@
 """How exactly returns were placed, and that errors of places and ranges hold it: traced strips with noise on points."""
 
 import json
-from dataclasses import replace
 
 import footprints
 import numpy as np
 import pytest
 from commands import run_command
-from facet_strips import Facet, Sensor
-from facet_strips import write_strip as write_facets
 from footprints import EAST, NORTH, Flight, Plane, match, roofs, write_strip
 
 import wavebatch as wb
@@ -64,18 +61,6 @@ def test_the_scatter_of_points_is_measured(tmp_path, scatter):
     found = measure(tmp_path / "a.las")
     assert found.scatter == pytest.approx(scatter, rel=0.15)
     assert found.phase == pytest.approx(scatter, rel=0.15)  # these locations have no phase
-
-
-def test_points_of_two_channels_that_are_exact_have_no_scatter(tmp_path):
-    sensor = replace(Sensor(), gains={1: 1.0, 2: 0.6})
-    write_facets(tmp_path / "a.las", [Facet(0.3, slope=(0.2, 0.1))], sensor, 5000)
-    assert measure(tmp_path / "a.las").scatter < 0.004
-
-
-def test_a_phase_of_the_pulse_is_no_scatter(tiny_strip):
-    """Locations of simulated returns are up to half a sample off, their points are true."""
-    found = measure(tiny_strip)
-    assert found.scatter < 0.005 and 0.03 < found.phase < 0.07
 
 
 def test_scatter_and_phase_are_printed_and_in_the_report(tiny_strip, tmp_path):

@@ -213,14 +213,6 @@ def test_pulses_of_equal_time_are_not_one(canopy, tmp_path, apart):
         assert summary.pulses == n / 2 and summary.left_out + summary.waveforms > n
 
 
-def test_where_takes_whole_pulses(strips, tmp_path):
-    """The ground's return chooses the pulse, with its canopy."""
-    summary, found = voxelize(strips[1], tmp_path, where="z < 102")
-    whole, _ = voxelize(strips[1], tmp_path)
-    assert 0.8 * N < summary.pulses < N and summary.waveforms + summary.left_out == whole.waveforms
-    assert shares(found, LAYERS)[0] > 0.1
-
-
 def test_times_of_many_packets_are_no_pulse(canopy, tmp_path):
     """A constant time is none, nor is 0: each packet stays a pulse."""
     *pulses, _ = canopy

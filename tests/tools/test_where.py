@@ -8,14 +8,12 @@ import pytest
 from batch_tools import run_one
 from commands import run_command
 
-from wavebatch.core.condition import parse_condition
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.pairing import compare_clouds
 from wavebatch.tools.plots.draw_cloud import count_values
 from wavebatch.tools.return_stats import count_returns
-from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 TEXT = "number_of_returns >= 2 and echo_width < 5"
 CHOSEN = PointFilter.build(where=TEXT)
@@ -50,15 +48,6 @@ def test_readers_give_the_points_that_meet_it(cloud, split):
         assert some.left_out == total - number
 
 
-def test_stats_counts_them_and_what_is_left_out(cloud, split):
-    path, number, total = split
-    (found,), _ = count_returns([cloud], chosen=CHOSEN)
-    (wanted,), _ = count_returns([path])
-    assert (found.points, found.left_out) == (number, total - number)
-    assert (found.by_number, found.separations, found.flags) == (wanted.by_number, wanted.separations, wanted.flags)
-    assert any(line.startswith(f"--where: {total - number} of {total} points") for line in found.warnings)
-
-
 def test_histograms_count_them(cloud, split):
     path, number, total = split
     found = count_values([cloud], "amplitude", CHOSEN, bins=20)
@@ -66,19 +55,6 @@ def test_histograms_count_them(cloud, split):
     assert (found.total.points, found.total.left_out) == (total, total - number)
     assert found.total.values == wanted.total.values
     np.testing.assert_array_equal(found.counts, wanted.counts)
-
-
-def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path):
-    all_, some, rest = (
-        voxelize_strip(tiny_strip, tmp_path / f"{number}.npz", VoxelOptions(2.0, chosen=PointFilter(where=where)))
-        for number, where in enumerate(
-            [None, parse_condition("number_of_returns >= 2"), parse_condition("not number_of_returns >= 2")]
-        )
-    )
-    assert 0 < some.waveforms < all_.waveforms == some.waveforms + some.left_out
-    # Returns of a pulse have one number of returns: both parts make the whole.
-    assert some.waveforms + rest.waveforms == all_.waveforms
-    assert some.energy + rest.energy == pytest.approx(all_.energy, rel=1e-6)
 
 
 def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
