@@ -597,9 +597,10 @@ def test_an_outline_around_many_fields_is_named_and_in_the_error(tmp_path, calib
     assert load_calibration(tmp_path / "cal.toml").relative_error > 0.12
 
 
-def test_a_target_that_is_listed_twice_does_not_halve_the_error(tmp_path, calibrated):
-    row = f"0.3,{EAST + 50},{NORTH + 10},"
-    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n{row}8\n{row}7\n")
+@pytest.mark.parametrize("off", [0, 4])
+def test_a_target_that_is_listed_twice_does_not_halve_the_error(tmp_path, calibrated, off):
+    rows = f"0.3,{EAST + 50},{NORTH + 10},8\n0.3,{EAST + 50 + off},{NORTH + 10},4\n"
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n{rows}")
     done = call("calibrate", calibrated / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
     assert done.exit_code == 2 and "targets 1 and 2 are one target: its reflectance would count twice" in done.stderr
 

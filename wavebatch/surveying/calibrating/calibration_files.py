@@ -223,12 +223,17 @@ def load_targets(path: Path | str) -> list[Target]:
     targets = [replace(_read_target(row, f"{path}: target {i}"), file=file) for i, row in enumerate(rows, 1)]
     if not targets:
         raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")
-    seen: dict[tuple[float, ...], int] = {}
+    centres = np.array([one.corners.mean(axis=0) for one in targets])
+    alike = np.array([one.reflectance for one in targets])
     for number, one in enumerate(targets, 1):
-        first = seen.setdefault((one.reflectance, *one.corners.mean(axis=0).round(6).tolist()), number)
-        if first != number:
+        # Two outlines of one surface: the middle of one lies in the other.
+        within = find_inside([one.corners], *centres.T) | np.isclose(centres, centres[number - 1], 0, 1e-6).all(axis=1)
+        same = np.flatnonzero(within & (alike == one.reflectance)) + 1
+        others = same[same != number]
+        if len(others):
+            first, second = sorted((number, int(others[0])))
             raise ConfigError(
-                f"{path}: targets {first} and {number} are one target: its reflectance would count twice; leave one out"
+                f"{path}: targets {first} and {second} are one target: its reflectance would count twice; leave one out"
             )
     return targets
 
