@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from strangers import judge_strip
 from writer_tools import data_file
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
@@ -99,6 +100,14 @@ def test_parts_of_a_stranger_have_one_width(part):
     with StripReader(data_file("lvis/lvis1.las")) as reader, reader.scan() as scan, leave_out("nasa-lvis"):
         half = [block.rows(slice(part, None, 2)) for block in read_sample(reader, scan)]
         assert _half_width(survey_blocks(half).system) == pytest.approx(6.68, rel=0.05)
+
+
+@pytest.mark.quick_cases("1440")
+@pytest.mark.parametrize("number", [1440, 2240, 669])
+def test_a_pulse_that_sees_no_echo_does_not_win_by_having_none(number, tmp_path):
+    """24 waveforms with echoes; and pulses of 1.4 and 1.6 samples in noise of colour, taken for 270 to 450."""
+    result = judge_strip(number, tmp_path)
+    assert result["right"] and 0.95 < result["width_ratio"] < 1.2
 
 
 def test_surveys_can_do_without_a_known_sensor():

@@ -251,21 +251,24 @@ def test_none_is_taken_only_where_it_was_looked_at(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("errors", "echoes", "known", "taken"),
+    ("errors", "echoes", "known", "answered", "taken"),
     [
-        (1.0, 100, False, False), (2.0, 100, False, True),  # as many echoes, in place of a learned pulse: HINT
-        (2.0, 103, False, False), (4.0, 103, False, True),  # some more: SURE
-        (2.0, 90, False, True), (1.0, 90, False, False),  # fewer, in place of a learned pulse: HINT
-        (2.0, 90, True, False),  # in place of a known one
-        (4.0, 110, True, False), (5.0, 110, True, True),  # more: both
+        (1.0, 100, False, 100, False), (2.0, 100, False, 100, True),  # as many, in place of a learned pulse: HINT
+        (2.0, 103, False, 100, False), (4.0, 103, False, 100, True),  # some more: SURE
+        (2.0, 90, False, 90, True), (1.0, 90, False, 90, False),  # fewer, in place of a learned pulse: HINT
+        (2.0, 90, True, 90, False),  # in place of a known one
+        (4.0, 110, True, 100, False), (5.0, 110, True, 100, True),  # more: both
+        (4.0, 160, True, 140, False), (2.0, 160, True, 160, True),  # the first one sees 71 and 62 % of the waveforms
+        (3.0, 110, True, 16, True), (2.7, 110, True, 16, False),  # 16 waveforms with an echo cannot show more
     ],
 )  # fmt: skip
-def test_a_pulse_with_more_echoes_must_describe_shorter_by_more(errors, echoes, known, taken):
+def test_a_pulse_with_more_echoes_must_describe_shorter_by_more(errors, echoes, known, answered, taken):
     """Two pulses as simple: the second is described shorter by so many standard errors."""
     spread = 0.5 * np.resize([1.0, -1.0], 400)
-    first = choose_pulse.Candidate("first", SystemPulse(2.0), 0.0, 50 + 0 * spread, 100, known, 2, 0.0)
+    seen = min(answered, 100)
+    first = choose_pulse.Candidate("first", SystemPulse(2.0), 0.0, 50 + 0 * spread, 100, seen, known, 2, 0.0)
     length = first.length - errors * 0.5 / np.sqrt(400) + spread
-    second = choose_pulse.Candidate("second", SystemPulse(2.2), 0.0, length, echoes, True, 3, 0.0)
+    second = choose_pulse.Candidate("second", SystemPulse(2.2), 0.0, length, echoes, answered, True, 3, 0.0)
     assert second.name == choose_pulse._decide([first, second]).best.name or not taken
     assert taken or choose_pulse._decide([first, second]).best.name == "first"
 
