@@ -93,7 +93,7 @@ start: they had 3 to 5 % of false echoes in place of 1 to 2."""
 MISFITS = LEAST_MISFIT * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried, up to MOST_MISFIT."""
 
-OF_ALL = "gaussian of all echoes"
+OF_ALL, AGAIN = "gaussian of all echoes", ", again"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
 
@@ -222,10 +222,9 @@ def choose_pulse(
     found = _try_changes(held, found)
     choice = _decide(found)
     if abs(choice.best.system.sigma_ref / begin.system.sigma_ref - 1) > OTHER_WIDTH and choice.best.name in starts:
-        # Few waveforms showed another start: what was learned from it is of another pulse.
-        again = _learn(taught, choice.best)
-        found = [one for one in found if one.name not in (OF_ALL, *ROUNDS)]
-        found += _try_changes(held, [_judge(held, name, system, CHANGES[1], known=False) for name, system in again])
+        # Few waveforms showed another start: what was learned from it may be of another pulse.
+        again = {name + AGAIN: system for name, system in _learn(taught, choice.best)}
+        found += _try_changes(held, [_judge(held, *one, CHANGES[1], known=False) for one in again.items()])
         choice = _decide(found)
     if choice.tied and len(rows) < len(block):
         others = np.delete(np.arange(len(block)), rows[::2])
@@ -235,11 +234,12 @@ def choose_pulse(
 
 def _learn_from_all(block: WaveformBlock, best: Candidate) -> Candidate:
     """The chosen pulse, where it was learned from half of these waveforms, learned from all of them."""
-    if best.name == OF_ALL:
+    name = best.name.removesuffix(AGAIN)
+    if name == OF_ALL:
         return replace(best, system=_find_gaussian(block, best.system, best.change))
-    if best.name not in ROUNDS:
+    if name not in ROUNDS:
         return best
-    explained = explain(block, bear(best.system, best.change), **ROUNDS[best.name])
+    explained = explain(block, bear(best.system, best.change), **ROUNDS[name])
     return replace(best, system=learn_jointly(block, best.system, explained, best.change, last=True))
 
 
