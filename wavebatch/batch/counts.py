@@ -258,15 +258,15 @@ def list_sums(counts: Mapping[str, Any], points: str) -> dict[str, dict[str, int
     def take(*names: str) -> dict[str, int]:
         return {name: counts[name] for name in names}
 
-    def take_passed(flag: EchoFlag) -> dict[str, int]:
-        return {name: number for name, number in passed.items() if name.endswith(f" {flag.name}")}
-
+    without, broken, silent = (
+        {name: number for name, number in passed.items() if name.endswith(f" {flag}")} for flag in _PASSED
+    )
     return {
         "points_in": take("points_with_waveform", "points_without_waveform", "points_broken"),
         "points_with_waveform": take("matched_returns", "unmatched_returns", "no_echo_returns"),
-        "points_without_waveform": take_passed(EchoFlag.NO_WAVEFORM),
-        "points_broken": take_passed(EchoFlag.BROKEN_PACKET),
-        "no_echo_returns": {**take_passed(EchoFlag.NO_ECHO), "unmatched_returns": -counts["unmatched_returns"]},
+        "points_without_waveform": without,
+        "points_broken": broken,
+        "no_echo_returns": {**silent, "unmatched_returns": -counts["unmatched_returns"]},
         "echoes": take("matched_returns", "added_echoes"),
         "points_out": {**take("echoes" if points == "echoes" else "matched_returns"), **passed, **left},
     }

@@ -27,7 +27,6 @@ from wavebatch.core.no_data import REASONS, NoData, without_nan
 from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.files.disk.raw_bytes import take_fingerprint
-from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
 from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
@@ -146,7 +145,13 @@ def build_document(
         Plain values for JSON; all but `timing` is the same for every run.
     """
     facts, layout = prepared.facts, prepared.layout
-    job = prepared.job
+    job, known = prepared.job, prepared.system.radiometry
+    lacks = {NoData.NOT_CALIBRATED: known.constant is None, NoData.NO_DIVERGENCE: known.divergence is None}
+    not_computed = {}
+    for column, needs in _NEEDS.items():
+        if column not in job.chain.makes:
+            reason = next((REASONS[need][0] for need in needs if lacks[need]), None)
+            not_computed[column] = reason or f"the chain has no stage attribute.{column}"
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     found = {
         "schema": STRIP_SCHEMA,
@@ -169,7 +174,7 @@ def build_document(
             "kept_extra_bytes": [carried.record.name for carried in layout.carried],
             "copied_to_added_echoes": dict.fromkeys(layout.copied, report.count("added_echoes")),
             "columns": {written.column: written.record.name for written in layout.written},
-            "not_computed": explain_absence(prepared),
+            "not_computed": not_computed,
         },
         **report.to_json(),
     }
@@ -193,11 +198,6 @@ def build_timing(report: RunReport) -> dict[str, Any]:
     rate = round(report.count("waveforms") / total.processor) if total.processor > 0 else None
     sums = {f"total_{kind}_seconds": round(getattr(total, kind), 6) for kind in ("processor", "wall")}
     return {**by_task, **sums, "waveforms_per_processor_second": rate}
-
-
-def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Write a JSON file, whole or not at all; raises InputError where it exists or cannot be written."""
-    write_text(path, format_report(document), overwrite=overwrite)
 
 
 def format_report(document: Mapping[str, Any]) -> str:
@@ -474,28 +474,6 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         found += warn("false-echoes", [line])
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
-
-
-def explain_absence(prepared: Prepared) -> dict[str, str]:
-    """Explain why physical columns are not computed.
-
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    dict of str to str
-        The reason by column.
-    """
-    chain, known = prepared.job.chain, prepared.system.radiometry
-    lacks = {NoData.NOT_CALIBRATED: known.constant is None, NoData.NO_DIVERGENCE: known.divergence is None}
-    reasons = {}
-    for column, needs in _NEEDS.items():
-        if column not in chain.makes:
-            reason = next((REASONS[need][0] for need in needs if lacks[need]), None)
-            reasons[column] = reason or f"the chain has no stage attribute.{column}"
-    return reasons
 
 
 def _look_out(prepared: Prepared, report: RunReport) -> AngleOutlook | None:

@@ -160,7 +160,7 @@ def run_batch(
         if saved is None and result.failed == len(jobs) and not any(options.folder.glob("*.report.json")):
             # No cloud was written: the next run, perhaps of other strips, would use the survey of this flight.
             with contextlib.suppress(OSError):
-                flight_path(options.folder).unlink(missing_ok=True)
+                (options.folder / FLIGHT_FILE).unlink(missing_ok=True)
     return result
 
 
@@ -178,7 +178,7 @@ def _survey_flight(
     samples = read_samples(paths, direction=first.direction, headerless=first.headerless, spread=workers.map)
     if not samples:
         return None
-    path = flight_path(options.folder)
+    path = options.folder / FLIGHT_FILE
     flight = survey_flight(samples, spread=workers.map)
     text = format_survey(flight.saved)
     saved = parse_survey(text, str(path))  # as a later run reads it, so that its identity is the same
@@ -391,13 +391,12 @@ def find_outputs(job: StripJob, folder: Path) -> list[Path]:
     """Return the files that the job may write."""
     cloud = cloud_path(job, folder)
     packets = [cloud.with_suffix(".wdp")] if job.options.keep_packets else []
-    flight = [flight_path(folder)] if job.request.flight else []
+    flight = [folder / FLIGHT_FILE] if job.request.flight else []
     return [cloud, report_path(job, folder), *packets, *flight]
 
 
-def flight_path(folder: Path) -> Path:
-    """Return the path of the survey of a flight in the folder of its clouds."""
-    return folder / "flight.system.toml"
+FLIGHT_FILE = "flight.system.toml"
+"""The survey of a flight, in the folder of its clouds."""
 
 
 def load_flight(jobs: Sequence[StripJob], options: RunOptions) -> SavedSurvey | None:
@@ -418,7 +417,7 @@ def load_flight(jobs: Sequence[StripJob], options: RunOptions) -> SavedSurvey | 
     ConfigError
         Where the file cannot be read or holds no survey of a flight.
     """
-    path = flight_path(options.folder)
+    path = options.folder / FLIGHT_FILE
     if options.overwrite or not any(job.request.flight for job in jobs) or not os.path.lexists(path):
         return None
     saved = load_survey(path)

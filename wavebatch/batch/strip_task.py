@@ -155,7 +155,7 @@ class StripTask:
         elif self._submitted < self.prepared.units:
             arguments = self._blob, self._submitted, self._options.block_size
             if self._second is None:
-                self._call(workers, self._take_unit, process_unit, *arguments)
+                self._call(workers, self._take_rows, process_unit, *arguments)
             else:
                 from wavebatch.batch.neighbour_pass import begin_unit
 
@@ -163,7 +163,7 @@ class StripTask:
             self._submitted += 1
         else:
             function, arguments = _given(self._second).next_call(self._blob)
-            self._call(workers, self._take_second, function, *arguments)
+            self._call(workers, self._take_rows, function, *arguments)
 
     def _call(self, workers: Workers | Cluster, take: Callable[[Any], None], function: Callable, *given: Any) -> None:
         self.pending.append(workers.submit(function, *given))
@@ -196,10 +196,6 @@ class StripTask:
 
             self._second = SecondPass(prepared.second_step, prepared.layout.source.header.scales, cloud)
 
-    def _take_unit(self, unit: UnitResult) -> None:
-        self.written += 1
-        self._add_rows(unit)
-
     def _take_begun(self, begun: tuple[tuple[np.ndarray, np.ndarray], RunReport]) -> None:
         start = Seconds.now()
         entries, report = begun
@@ -207,26 +203,26 @@ class StripTask:
         self.written += 1
         self._report += report + RunReport(timing={"write": Seconds.now() - start})
 
-    def _take_second(self, result: Any) -> None:
-        made = _given(self._second).take(result)
-        if isinstance(made, UnitResult):
-            self._add_rows(made)
+    def _take_rows(self, made: Any) -> None:
+        """Rows of LAS are written at once, those of LAZ wait until they fill a chunk; a second pass takes its part."""
+        if self._second is None:
+            self.written += 1
         else:
+            made = self._second.take(made)
+        if not isinstance(made, UnitResult):
             self._report += made
-
-    def _add_rows(self, unit: UnitResult) -> None:
-        """Rows of LAS are written at once, those of LAZ wait until they fill a chunk."""
+            return
         start, writer = Seconds.now(), _given(self._writer)
-        writer.count_rows(unit.statistics)
-        for chunk in unit.chunks:
+        writer.count_rows(made.statistics)
+        for chunk in made.chunks:
             writer.append(chunk)
         if self.job.options.format == "laz":
-            self._packing.add(unit.rows)
+            self._packing.add(made.rows)
         else:
-            rows = unit.rows.read(0, len(unit.rows))
+            rows = made.rows.read(0, len(made.rows))
             writer.append(Chunk(len(rows), rows.view(np.uint8)))
-            unit.rows.close()
-        self._report += unit.report + RunReport(timing={"write": Seconds.now() - start})
+            made.rows.close()
+        self._report += made.report + RunReport(timing={"write": Seconds.now() - start})
 
     def _take_chunk(self, packed: tuple[Chunk, Seconds]) -> None:
         start = Seconds.now()

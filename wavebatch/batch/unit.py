@@ -38,7 +38,7 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.kernels.geometry.normals import find_edges
 from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
-from wavebatch.stages.chain import Chain, Solved, Step
+from wavebatch.stages.chain import Solved, Step
 from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import ChainChoice, try_chain, without_columns
 from wavebatch.surveying.flat_ground import (
@@ -185,7 +185,17 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
                 )
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += StripWarning.of("beam", more)
-            job = replace(job, chain=_set_parameters(reader, scan, job.chain))
+            # The distance between the points decides a radius that is 0, and the strip's slopes the error of level
+            # reflectances where no slope is given.
+            steps = []
+            for step in job.chain.steps:
+                if step.stage.second_pass is not None and step.effective()["radius"] == 0:
+                    step = replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
+                elif step.stage.name == "attribute.level_reflectance" and not step.parameters:
+                    slope = max(step.effective()["slope"], round(measure_slope(reader, scan), 1))
+                    step = replace(step, parameters={"slope": min(slope, STEEP)})
+                steps.append(step)
+            job = replace(job, chain=replace(job.chain, steps=tuple(steps)))
             if job.calibration is not None:
                 doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
@@ -195,20 +205,6 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
     report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
     found = choice, layout, chosen, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
-
-
-def _set_parameters(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
-    """The chain with what the strip decides: a radius in place of one of 0, by the distance between the points; and in
-    the error of level reflectances, where no slope is given, the strip's slopes."""
-    steps = []
-    for step in chain.steps:
-        if step.stage.second_pass is not None and step.effective()["radius"] == 0:
-            step = replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
-        elif step.stage.name == "attribute.level_reflectance" and not step.parameters:
-            slope = max(step.effective()["slope"], round(measure_slope(reader, scan), 1))
-            step = replace(step, parameters={"slope": min(slope, STEEP)})
-        steps.append(step)
-    return replace(chain, steps=tuple(steps))
 
 
 def _see_level(

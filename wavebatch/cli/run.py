@@ -296,14 +296,15 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
 
 def _report(document: dict[str, Any], target: str | None) -> bool:
     """Writes the summary; returns whether that worked. The clouds are written, whatever becomes of it."""
-    from wavebatch.batch.report_file import write_json
+    from wavebatch.batch.report_file import format_report
+    from wavebatch.files.text_file import write_text
 
     if target == "-":
         return messages.print_safely(messages.format_json(document))
     try:
         if target is not None:
             Path(target).parent.mkdir(parents=True, exist_ok=True)
-            write_json(Path(target), document, overwrite=True)
+            write_text(Path(target), format_report(document), overwrite=True)
     except InputError as error:
         messages.talk(f"error: --report: {messages.one_line(error)}")
         return False

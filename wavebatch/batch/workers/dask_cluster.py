@@ -85,10 +85,36 @@ class Cluster:
                 problem = "has no workers; start some: dask worker ADDRESS"
                 raise ConfigError(f"--scheduler {self.address}: {problem}") from error
             self._workers = dict(self._client.nthreads())
-            self._check_versions()
+            here = describe_worker()
+            for worker, kind in sorted(self._ask(describe_worker).items()):
+                if why := compare_workers(here, kind):
+                    raise ConfigError(f"--scheduler {self.address}: worker {worker} {why}")
+            try:
+                self._client.run_on_scheduler(describe_worker)
+            except Exception as error:
+                raise ConfigError(
+                    f"--scheduler {self.address}: the scheduler cannot load wavebatch ({shorten_error(error)}); "
+                    "install the same there"
+                ) from error
             with reporting(self._folder):
                 self._folder.mkdir(parents=True, exist_ok=True)
-            self._check_files()
+            shared = (
+                "strips and outputs must lie on a file system that all workers share, under the same names, and they "
+                "must be the same files"
+            )
+            with Draft(self._folder / "workers", overwrite=False) as token:  # never published
+                token.file.write(b"seen")
+                token.file.flush()
+                paths = [path.absolute() for path in self._files]
+                strips = [(path, *filter(Path.exists, list_packet_files(path))) for path in paths]
+                self._shared = [str(file) for strip in strips for file in strip]
+                files = [*self._shared, str(token.path)]
+                sizes = list_sizes(files)
+                for worker, there in sorted(self._ask(list_sizes, files).items()):
+                    lost = [file for file, mine, theirs in zip(files, sizes, there, strict=True) if mine != theirs]
+                    if lost:
+                        what = f"{self._folder}" if lost == files[-1:] else lost[0]
+                        raise ConfigError(f"--scheduler {self.address}: worker {worker} does not see {what}; {shared}")
             self._scratch = stack.enter_context(owning_scratch(self._folder))
             self._shared += [str(file) for file in self._scratch.iterdir()] if self._scratch else []
             self._stack = stack.pop_all()
@@ -158,38 +184,6 @@ class Cluster:
 
     def restart(self) -> None:
         """Do nothing: calls of a worker that died go to the others."""
-
-    def _check_versions(self) -> None:
-        """Raise ConfigError where the scheduler or a worker is not of the kind of this process."""
-        here = describe_worker()
-        for worker, kind in sorted(self._ask(describe_worker).items()):
-            if why := compare_workers(here, kind):
-                raise ConfigError(f"--scheduler {self.address}: worker {worker} {why}")
-        try:
-            self._client.run_on_scheduler(describe_worker)
-        except Exception as error:
-            raise ConfigError(
-                f"--scheduler {self.address}: the scheduler cannot load wavebatch ({shorten_error(error)}); "
-                "install the same there"
-            ) from error
-
-    def _check_files(self) -> None:
-        """Raise ConfigError where a worker does not see a strip, or sees another folder of the same name."""
-        shared = (
-            "strips and outputs must lie on a file system that all workers share, under the same names, and they must "
-            "be the same files"
-        )
-        with Draft(self._folder / "workers", overwrite=False) as token:  # never published
-            token.file.write(b"seen")
-            token.file.flush()
-            self._shared = [str(file) for path in self._files for file in _with_packets(path.absolute())]
-            files = [*self._shared, str(token.path)]
-            here = list_sizes(files)
-            for worker, there in sorted(self._ask(list_sizes, files).items()):
-                lost = [file for file, mine, theirs in zip(files, here, there, strict=True) if mine != theirs]
-                if lost:
-                    what = f"{self._folder}" if lost == files[-1:] else lost[0]
-                    raise ConfigError(f"--scheduler {self.address}: worker {worker} does not see {what}; {shared}")
 
     def _ask(self, function: Callable, *arguments: Any) -> dict[str, Any]:
         """The answer of each worker."""
@@ -264,11 +258,6 @@ def _work(call: bytes) -> bytes:
 def _introduce(files: list[str]) -> tuple[dict[str, str], list[int]]:
     """On a worker: its kind, and the sizes of the files as it sees them."""
     return describe_worker(), list_sizes(files)
-
-
-def _with_packets(path: Path) -> list[Path]:
-    """The strip, and the packet file beside it."""
-    return [path, *filter(Path.exists, list_packet_files(path))]
 
 
 _CONNECT = 4.0

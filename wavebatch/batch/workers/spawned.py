@@ -57,8 +57,7 @@ def start_early(jobs: int, needs_main: bool = False) -> None:
     InputError
         Where the system has no more processes.
     """
-    # Half a start would leave a process that complains.
-    with uninterrupted(), _single_threaded(), _ctrl_c_held(), contextlib.nullcontext() if needs_main else _no_main():
+    with uninterrupted(), _as_children(needs_main):  # half a start would leave a process that complains
         while len(_early) < jobs:
             try:
                 _early.append(_Process())
@@ -168,38 +167,26 @@ class PipedProcess:
 
 
 @contextlib.contextmanager
-def _no_main() -> Iterator[None]:
-    """Processes that are started inside do not import the user's script: multiprocessing finds an empty one."""
-    before = sys.modules["__main__"]
-    sys.modules["__main__"] = types.ModuleType("__main__")
+def _as_children(needs_main: bool) -> Iterator[None]:
+    """Processes that are started inside use one thread per library, and modules of the installation only.
+
+    They do not see Ctrl-C, which a terminal sends to them too. Unless they need it, they do not import the user's
+    script either: multiprocessing finds an empty one.
+    """
+    main, variables = sys.modules["__main__"], {name: os.environ[name] for name in CHILD if name in os.environ}
+    can_mask = hasattr(signal, "pthread_sigmask")
+    if can_mask:
+        resource_tracker.ensure_running()  # the start of the first process would do it, and let the signals through
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
+        os.environ.update(CHILD)
+        if not needs_main:
+            sys.modules["__main__"] = types.ModuleType("__main__")
         yield
     finally:
-        sys.modules["__main__"] = before
-
-
-@contextlib.contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Libraries of processes that are started inside use one thread each, and modules of the installation only."""
-    before = {name: os.environ[name] for name in CHILD if name in os.environ}
-    os.environ.update(CHILD)
-    try:
-        yield
-    finally:
+        sys.modules["__main__"] = main
         for name in CHILD:
-            del os.environ[name]
-        os.environ.update(before)
-
-
-@contextlib.contextmanager
-def _ctrl_c_held() -> Iterator[None]:
-    """Processes that are started inside do not see Ctrl-C, which a terminal sends to them too."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # the start of the first process would do it, and let the signals through
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            os.environ.pop(name, None)
+        os.environ.update(variables)
+        if can_mask:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
