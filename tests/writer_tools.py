@@ -12,7 +12,6 @@ import pytest
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud import writer as layout
 from wavebatch.files.cloud.writer import OutputLayout
-from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.header import LasHeader, Vlr, build_dtype, encode_evlr_header, read_header
 from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.files.las.write_points import PointFile
@@ -68,14 +67,16 @@ def write_source(
     points = random_points(dtype, n) if points is None else points
     filled = LasHeader(version, point_format, dtype.itemsize, (0.01,) * 3, (1000.0, 2000.0, 30.0), **header)
     filled.vlrs = list(vlrs or [])
-    file = PointFile(path, filled, dtype, list(records), overwrite=True)
+
+    class WithRecords(PointFile):
+        def _append_records(self):
+            for user_id, record_id, payload in evlrs or []:
+                head = encode_evlr_header(user_id, record_id, len(payload), b"of a test")
+                self.append_record(head, io.BytesIO(payload), 0, len(payload))
+
+    file = WithRecords(path, filled, dtype, list(records), overwrite=True)
     file.write(points)
-    file.finish_points()
-    for user_id, record_id, payload in evlrs or []:
-        head = encode_evlr_header(user_id, record_id, len(payload), b"of a test")
-        file.append_record(head, io.BytesIO(payload), 0, len(payload))
-    file.finish()
-    publish_together([file.draft])
+    file.commit()
     return points
 
 

@@ -452,7 +452,7 @@ def test_more_points_than_an_old_header_counts(tmp_path):
     points = write_source(tmp_path / "a.las", 4, (1, 3))
     layout = plan_output(tmp_path / "a.las", [], las_version="1.3")
     with CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud:
-        cloud._statistics.count = 2**32 - 100
+        cloud.statistics.count = 2**32 - 100
         with pytest.raises(InputError, match="LAS 1.3 holds at most 4294967295 points; use --las-version 1.4"):
             cloud.write(layout.rows(points))
 

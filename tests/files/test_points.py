@@ -250,7 +250,7 @@ def test_chunks_from_elsewhere_are_joined_to_the_same_file(tmp_path, point_forma
         for part, chunk in zip(parts, reversed(packed), strict=True):
             statistics = Statistics(rows.dtype, RECORDS)
             statistics.add(part)
-            file.count_rows(statistics)
+            file.statistics.join(statistics)
             file.append(pickle.loads(chunk))
         whole.write(rows)
         file.commit()

@@ -120,7 +120,7 @@ def test_without_a_compiler_pip_is_asked_for_one(checkout, monkeypatch, tmp_path
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    asked = dict.fromkeys(("wheel", "sdist"), lambda settings: ["setuptools"])  # it would replace distutils here
+    asked = dict.fromkeys(("wheel", "sdist"), lambda settings=None: ["setuptools"])  # it would replace distutils here
     hooks = SimpleNamespace(**{f"get_requires_for_build_{name}": hook for name, hook in asked.items()})
     monkeypatch.setattr(checkout, "_setuptools", lambda: hooks)
     assert "ziglang" in checkout.get_requires_for_build_wheel()

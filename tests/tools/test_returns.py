@@ -16,7 +16,6 @@ from writer_tools import write_points
 from wavebatch.cli.clouds import SHOWN, stats
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.geojson import Polygon
 from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype
 from wavebatch.files.las.write_points import PointFile
@@ -39,9 +38,7 @@ def write_cloud(path, time, z, number, total, *, flags=None, point_format=1):
     header = LasHeader((1, 2), point_format, 0, (0.001,) * 3, (0.0,) * 3)
     file = PointFile(path, header, dtype, records, overwrite=True)
     file.write(rows)
-    file.finish_points()
-    file.finish()
-    publish_together([file.draft])
+    file.commit()
     return path
 
 

@@ -81,10 +81,6 @@ WIDTH_BINS = LogBins(0.01, 0.01, 1200)
 _BINS = {"amplitude_dn": AMPLITUDE_BINS, "echo_width_ns": WIDTH_BINS}
 
 
-def _zeros(number: int) -> Any:
-    return field(default_factory=lambda: np.zeros(number, np.int64))
-
-
 @frozen(eq=False)
 class RunReport:
     """Counts and quality of a unit, a strip or a batch; `a + b` merges two."""
@@ -107,10 +103,10 @@ class RunReport:
     """Lines about the strip as a whole, from `report_file`."""
     warnings: tuple[StripWarning, ...] = ()
     """What makes the results doubtful, from `report_file`."""
-    echoes_per_waveform: np.ndarray = _zeros(OVERFLOW + 1)
-    amplitude: np.ndarray = _zeros(AMPLITUDE_BINS.number)
+    echoes_per_waveform: np.ndarray = field(default_factory=lambda: np.zeros(OVERFLOW + 1, np.int64))
+    amplitude: np.ndarray = field(default_factory=lambda: np.zeros(AMPLITUDE_BINS.number, np.int64))
     """Echoes per bin of AMPLITUDE_BINS."""
-    echo_width: np.ndarray = _zeros(WIDTH_BINS.number)
+    echo_width: np.ndarray = field(default_factory=lambda: np.zeros(WIDTH_BINS.number, np.int64))
     """Echoes per bin of WIDTH_BINS."""
     timing: Mapping[str, Seconds] = field(default_factory=dict)
     """By task, summed over all processes."""

@@ -65,7 +65,10 @@ class StripJob:
         divergence = any(value is not None for value in known)
         given = self.sensor != SensorRequest()
         chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
-        return with_columns(chain, (*self.columns, *self.chosen.list_wanted()))
+        # Columns that --where names exactly; the others are those of the input.
+        where = () if self.chosen.where is None else self.chosen.where.columns
+        named = (name for name in where if name in COLUMNS and COLUMNS[name].extra_bytes)
+        return with_columns(chain, (*self.columns, *named))
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with the job's calibration and air, if it has them."""

@@ -213,7 +213,7 @@ class StripTask:
             self._report += made
             return
         start, writer = Seconds.now(), _given(self._writer)
-        writer.count_rows(made.statistics)
+        writer.statistics.join(made.statistics)
         for chunk in made.chunks:
             writer.append(chunk)
         if self.job.options.format == "laz":

@@ -54,30 +54,6 @@ class _LogFile(logging.FileHandler):
         click.echo(f"warning: --log-file: cannot be written, so it ends here: {error}", err=True)
 
 
-def open_log(path: Path, level: str, command: str) -> None:
-    """Begin to write messages up to a level; the first line holds version and command.
-
-    Raises ConfigError if the file cannot be written, or is something else than a log.
-    """
-    from wavebatch import __version__
-
-    close_log()
-    begin = b""
-    try:
-        if os.path.isfile(path):
-            with open(path, "rb") as old:
-                begin = old.read(20)
-        elif os.path.lexists(path) and stat.S_ISFIFO(os.stat(path).st_mode):  # opening it would wait for a reader
-            raise ConfigError(f"--log-file: {path} is a pipe; choose a file")
-        if begin and not re.fullmatch(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", begin):
-            raise ConfigError(f"--log-file: {path} exists and is no log; choose another name")
-        _logger.addHandler(_LogFile(path))
-    except OSError as error:
-        raise ConfigError(f"--log-file: {path}: cannot be written: {error.strerror or error}") from error
-    _logger.setLevel(level.upper())
-    log_text(f"wavebatch {__version__}: {command}")
-
-
 def close_log() -> None:
     """End the log; harmless without one."""
     for handler in [one for one in _logger.handlers if isinstance(one, _LogFile)]:
@@ -110,13 +86,30 @@ def keep_level(context: click.Context, parameter: click.Parameter, level: str) -
 
 
 def begin_log(context: click.Context, parameter: click.Parameter, path: Path | None) -> None:
-    """Opens the log of --log-file before the command starts, and closes it after its end."""
+    """Opens the log of --log-file before the command starts, and closes it after its end.
+
+    Its first line has version and command. Nothing but a log is appended to.
+    """
+    from wavebatch import __version__
+
     if path is None or context.resilient_parsing:
         return
+    close_log()
+    begin = b""
     try:
-        open_log(path, context.meta.get(_LEVEL, "info"), typed_command(context))
-    except ConfigError as error:
-        raise click.UsageError(str(error), ctx=context) from error
+        if os.path.isfile(path):
+            with open(path, "rb") as old:
+                begin = old.read(20)
+        elif os.path.lexists(path) and stat.S_ISFIFO(os.stat(path).st_mode):  # opening it would wait for a reader
+            raise click.UsageError(f"--log-file: {path} is a pipe; choose a file", ctx=context)
+        if begin and not re.fullmatch(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", begin):
+            raise click.UsageError(f"--log-file: {path} exists and is no log; choose another name", ctx=context)
+        _logger.addHandler(_LogFile(path))
+    except OSError as error:
+        problem = f"--log-file: {path}: cannot be written: {error.strerror or error}"
+        raise click.UsageError(problem, ctx=context) from error
+    _logger.setLevel(context.meta.get(_LEVEL, "info").upper())
+    log_text(f"wavebatch {__version__}: {typed_command(context)}")
     context.meta[LOG] = path
     context.call_on_close(close_log)
 

@@ -303,40 +303,35 @@ def common_options(*names: str, failure: int = 1) -> Callable:
 
     def decorate(command: Callable) -> Callable:
         shared = (*names, "quiet", "log_file", "log_level", "config", "debug")
-        return together(*(_COMMON[name] for name in shared))(report_errors(failure)(_protected(command)))
+        # Outputs never replace inputs, nor each other.
+        @functools.wraps(command)
+        def call(*args: Any, **options: Any) -> Any:
+            context = click.get_current_context()
+            known = {one.name: one for one in context.command.params if isinstance(one, click.Option)}
+            default = ParameterSource.DEFAULT
+            given = {name: value for name, value in context.params.items()
+                     if name in known and context.get_parameter_source(name) is not default}  # fmt: skip
+            check_together(given, known, lambda name: max(known[name].opts, key=len) if name in known else typed(name))
+            inputs: list[Any] = list(context.meta.get(READ, ()))
+            outputs: dict[str, Any] = {}
+            if LOG in context.meta:
+                outputs[os.path.realpath(context.meta[LOG])] = [context.meta[LOG]]
+            for parameter in context.command.params:
+                value = context.params.get(parameter.name)
+                if isinstance(parameter.type, OutputPath):
+                    if value not in (None, "-"):
+                        outputs.setdefault(os.path.realpath(value), []).append(value)
+                elif isinstance(parameter.type, click.Path):
+                    inputs += value if isinstance(value, tuple) else [value]
+            with protecting(inputs):
+                for same in outputs.values():
+                    refuse_input(same[0])
+                    if len(same) > 1:
+                        raise ConfigError(f"{same[0]}: two outputs have this name; choose another for one of them")
+                return command(*args, **options)
+        return together(*(_COMMON[name] for name in shared))(report_errors(failure)(call))
 
     return decorate
-
-
-def _protected(command: Callable) -> Callable:
-    """The command; its outputs never replace its inputs, nor each other."""
-
-    @functools.wraps(command)
-    def call(*args: Any, **options: Any) -> Any:
-        context = click.get_current_context()
-        known = {one.name: one for one in context.command.params if isinstance(one, click.Option)}
-        given = {name: value for name, value in context.params.items()
-                 if name in known and context.get_parameter_source(name) is not ParameterSource.DEFAULT}  # fmt: skip
-        check_together(given, known, lambda name: max(known[name].opts, key=len) if name in known else typed(name))
-        inputs: list[Any] = list(context.meta.get(READ, ()))
-        outputs: dict[str, Any] = {}
-        if LOG in context.meta:
-            outputs[os.path.realpath(context.meta[LOG])] = [context.meta[LOG]]
-        for parameter in context.command.params:
-            value = context.params.get(parameter.name)
-            if isinstance(parameter.type, OutputPath):
-                if value not in (None, "-"):
-                    outputs.setdefault(os.path.realpath(value), []).append(value)
-            elif isinstance(parameter.type, click.Path):
-                inputs += value if isinstance(value, tuple) else [value]
-        with protecting(inputs):
-            for same in outputs.values():
-                refuse_input(same[0])
-                if len(same) > 1:
-                    raise ConfigError(f"{same[0]}: two outputs have this name; choose another for one of them")
-            return command(*args, **options)
-
-    return call
 
 
 _NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import operator
 from collections.abc import Callable
 from dataclasses import MISSING, FrozenInstanceError, dataclass, field, fields
 from typing import Any, TypeVar, dataclass_transform, overload
@@ -55,7 +56,7 @@ def frozen(kind: type | None = None, /, *, eq: bool = True, order: bool = False)
 @dataclass_transform(field_specifiers=(field,))
 def changeable(kind: type[T]) -> type[T]:
     """Make a dataclass with slots whose fields may be set: counters of a scan, headers, figures."""
-    _share(kind, {**_METHODS, "__eq__": _is_equal, "__hash__": None})
+    _share(kind, {**_METHODS, "__eq__": _EQUALITY["__eq__"], "__hash__": None})
     return dataclass(init=False, repr=False, eq=False, slots=True)(kind)
 
 
@@ -103,20 +104,8 @@ def _repr(self: Any) -> str:
     return f"{type(self).__qualname__}({', '.join(shown)})"
 
 
-def _is_equal(self: Any, other: object) -> bool:
-    return _values(self) == _values(other) if type(other) is type(self) else NotImplemented
-
-
-def _is_less(self: Any, other: object) -> bool:
-    return _values(self) < _values(other) if type(other) is type(self) else NotImplemented
-
-
-def _is_no_more(self: Any, other: object) -> bool:
-    return _values(self) <= _values(other) if type(other) is type(self) else NotImplemented
-
-
-def _hash(self: Any) -> int:
-    return hash(_values(self))
+def _compare(by: Callable[[Any, Any], bool]) -> Callable[[Any, object], bool]:
+    return lambda self, other: by(_values(self), _values(other)) if type(other) is type(self) else NotImplemented
 
 
 def _refuse(self: Any, name: str, value: object = None) -> None:
@@ -147,5 +136,5 @@ def _set_state(self: Any, state: Any) -> None:
 
 _METHODS = {"__init__": _init, "__repr__": _repr, "__setstate__": _set_state, "__signature__": _Signature()}
 _FROZEN = {"__setattr__": _refuse, "__delattr__": _refuse}
-_EQUALITY = {"__eq__": _is_equal, "__hash__": _hash}
-_ORDER = {"__lt__": _is_less, "__le__": _is_no_more}
+_EQUALITY = {"__eq__": _compare(operator.eq), "__hash__": lambda self: hash(_values(self))}
+_ORDER = {"__lt__": _compare(operator.lt), "__le__": _compare(operator.le)}

@@ -168,13 +168,15 @@ def solve_offset(known: Trajectory, start: float, stop: float) -> tuple[float, s
     middle, half = 0.5 * (start + stop), 0.5 * (float(known.time[-1]) + float(known.time[0]))
     candidates = [(0.0, "the same clock")]
     candidates += [(-ADJUSTED, "standard to adjusted GPS time"), (ADJUSTED, "adjusted to standard GPS time")]
+    in_weeks: list[tuple[float, str]] = []
     if -WEEK < known.time[0] < 2 * WEEK:
-        for shift, clock in ((0.0, "standard"), (-ADJUSTED, "adjusted")):
-            clocks = f"seconds of the week to {clock} GPS time"
-            candidates += [(offset, clocks) for offset in _whole_weeks(shift, middle - half)]
+        in_weeks += [(0.0, "seconds of the week to standard GPS time")]
+        in_weeks += [(-ADJUSTED, "seconds of the week to adjusted GPS time")]
     if 0 <= start <= WEEK < known.time[0]:
-        for shift in (0.0, ADJUSTED):
-            candidates += [(offset, "GPS time to seconds of the week") for offset in _whole_weeks(shift, middle - half)]
+        in_weeks += [(shift, "GPS time to seconds of the week") for shift in (0.0, ADJUSTED)]
+    for shift, clocks in in_weeks:  # each plus a whole number of weeks
+        week = np.rint((middle - half - shift) / WEEK)
+        candidates += [(float(shift + (week + k) * WEEK), clocks) for k in (-1, 0, 1)]
     best, least = (0.0, ""), 0.0
     for offset, clocks in candidates:
         share = known.shifted(offset).share_known(start, stop)
@@ -186,12 +188,6 @@ def solve_offset(known: Trajectory, start: float, stop: float) -> tuple[float, s
             f"{stop:.3f} s: they do not overlap on any clock (same, adjusted, seconds of the week)"
         )
     return best
-
-
-def _whole_weeks(shift: float, wanted: float) -> list[float]:
-    """Offsets near `wanted` that are `shift` plus a whole number of weeks."""
-    week = np.rint((wanted - shift) / WEEK)
-    return [float(shift + (week + k) * WEEK) for k in (-1, 0, 1)]
 
 
 def apply_lever_arm(xyz: np.ndarray, attitude: np.ndarray, arm: tuple[float, float, float]) -> np.ndarray:

@@ -355,10 +355,6 @@ class WaveformBlock:
         """Samples that were not recorded, bool (n, samples): `missing`, or none."""
         return np.zeros(self.samples.shape, bool) if self.missing is None else self.missing
 
-    def without_samples(self) -> WaveformBlock:
-        """The block with waveforms of no samples: their place, time and sensor are left."""
-        return replace(self, samples=np.empty((len(self), 0), self.samples.dtype), missing=None)
-
 
 @frozen(eq=False)
 class Noise:
@@ -381,11 +377,6 @@ class Noise:
     def level(self) -> np.ndarray:
         """Level without signal, float32 (n, 1), or (n, s) where it differs between the recordings of a packet."""
         return self.baseline[:, None] if self.of_sample is None else self.of_sample
-
-    @property
-    def for_fits(self) -> np.ndarray:
-        """The same as `kernels.fit.decompose.Samples` takes it, float32 (n,) or (n, s)."""
-        return self.baseline if self.of_sample is None else self.of_sample
 
     def rows(self, rows: np.ndarray) -> Noise:
         """The noise of the waveforms at `rows`."""

@@ -62,14 +62,6 @@ class AreaFile:
     extent: tuple[float, float, float, float] | None
     """West, south, east and north of all its corners, also of those of other areas; None: it has none."""
 
-    @property
-    def maybe_degrees(self) -> bool:
-        """Whether all corners could be longitude and latitude."""
-        if self.extent is None:
-            return True
-        west, south, east, north = self.extent
-        return west >= -180 and south >= -90 and east <= 180 and north <= 90
-
 
 def read_area_file(path: Path | str, member: Any, rings: Sequence[np.ndarray]) -> AreaFile:
     """Describe a file of areas.
@@ -125,6 +117,8 @@ def place_rings(file: AreaFile | None, rings: Sequence[np.ndarray], strip: Path,
     if file is None or not rings:
         return rings
     source = file.crs
+    west, south, east, north = file.extent or (0.0, 0.0, 0.0, 0.0)
+    maybe_degrees = west >= -180 and south >= -90 and east <= 180 and north <= 90
     if source is None:
         # Areas of a file without a CRS that lie in the strip are in its coordinates, be they small ones: the strip may
         # have a local grid. All areas of a file are in the same CRS, so its whole extent counts.
@@ -133,12 +127,12 @@ def place_rings(file: AreaFile | None, rings: Sequence[np.ndarray], strip: Path,
         # Degrees fit a strip that is in degrees itself, or in local metres near the origin.
         values = [*header.mins[:2], *header.maxs[:2]]
         fits = all(abs(value) <= most for value, most in zip(values, (180, 90, 180, 90), strict=True))
-        if not file.maybe_degrees or inside or fits:
+        if not maybe_degrees or inside or fits:
             return rings
         source = WGS84
     definition = read_crs_definition(strip, header)
     if definition is None:
-        if not file.maybe_degrees:
+        if not maybe_degrees:
             return rings  # nothing says that the CRS is not the strip's
         what = f"in degrees ({source})" if source in _SAME_DEGREES else f"in {source[:_LONGEST_NAME]}"
         raise InputError(

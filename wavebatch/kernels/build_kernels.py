@@ -105,29 +105,17 @@ def get_requires_for_build_wheel(config_settings: dict | None = None) -> list[st
     return [*_setuptools().get_requires_for_build_wheel(config_settings), *([] if find_compiler() else ["ziglang"])]
 
 
-def get_requires_for_build_editable(config_settings: dict | None = None) -> list[str]:
-    """As for a wheel."""
-    return get_requires_for_build_wheel(config_settings)
+get_requires_for_build_editable = get_requires_for_build_wheel
 
 
-def get_requires_for_build_sdist(config_settings: dict | None = None) -> list[str]:
-    """What setuptools asks for: a source distribution holds no library."""
-    return _setuptools().get_requires_for_build_sdist(config_settings)
-
-
-def prepare_metadata_for_build_wheel(metadata_directory: str, config_settings: dict | None = None) -> str:
-    """As setuptools does it."""
-    return _setuptools().prepare_metadata_for_build_wheel(metadata_directory, config_settings)
-
-
-def prepare_metadata_for_build_editable(metadata_directory: str, config_settings: dict | None = None) -> str:
-    """As setuptools does it."""
-    return _setuptools().prepare_metadata_for_build_editable(metadata_directory, config_settings)
-
-
-def build_sdist(sdist_directory: str, config_settings: dict | None = None) -> str:
-    """The sources; MANIFEST.in leaves out the library of this machine."""
-    return _setuptools().build_sdist(sdist_directory, config_settings)
+def __getattr__(hook: str) -> Any:
+    """The other hooks of PEP 517, as setuptools has them; MANIFEST.in leaves the library of this machine out."""
+    if hook not in (
+        "get_requires_for_build_sdist", "prepare_metadata_for_build_wheel", "prepare_metadata_for_build_editable",
+        "build_sdist",
+    ):  # fmt: skip
+        raise AttributeError(hook)
+    return getattr(_setuptools(), hook)
 
 
 def build_wheel(

@@ -256,7 +256,9 @@ class Solved(NamedTuple):
 
     def without_samples(self) -> Solved:
         """Leave the samples out."""
-        return self._replace(block=self.block.without_samples(), noise=replace(self.noise, of_sample=None))
+        empty = np.empty((len(self.block), 0), self.block.samples.dtype)
+        block = replace(self.block, samples=empty, missing=None)
+        return self._replace(block=block, noise=replace(self.noise, of_sample=None))
 
 
 @frozen

@@ -78,9 +78,12 @@ def find_stage(name: str, where: str) -> Stage:
     return STAGES[name]
 
 
+_SHIPPED = Path(__file__).with_name("profiles")
+
+
 def list_profiles() -> list[str]:
     """Return the names of the shipped chains, sorted."""
-    return sorted(file.name.removesuffix(".toml") for file in _shipped().iterdir() if file.name.endswith(".toml"))
+    return sorted(file.name.removesuffix(".toml") for file in _SHIPPED.iterdir() if file.name.endswith(".toml"))
 
 
 def load_profile(name: str) -> Chain:
@@ -103,7 +106,7 @@ def load_profile(name: str) -> Chain:
     """
     if name not in list_profiles():
         raise ConfigError(f"profile {name!r} does not exist; {nearest(name, list_profiles())}")
-    return parse_chain((_shipped() / f"{name}.toml").read_text("utf-8"), f"profile {name}")
+    return parse_chain((_SHIPPED / f"{name}.toml").read_text("utf-8"), f"profile {name}")
 
 
 def load_chain_file(path: Path | str) -> Chain:
@@ -188,10 +191,6 @@ def format_step(stage: str, parameters: Mapping[str, Any]) -> str:
         The table.
     """
     return format_toml({"chain": [{"stage": stage, **parameters}]}).lstrip()
-
-
-def _shipped() -> Path:
-    return Path(__file__).with_name("profiles")
 
 
 def _read_step(table: TomlTable) -> Step:

@@ -155,16 +155,10 @@ class ErrorStats:
         """Compute statistics of errors (k,) with their bounds and reported standard deviations (NaN: none)."""
         known = np.isfinite(reported) & (reported > 0)
         scaled = error[known] / reported[known]
-        return cls(
-            number=len(error),
-            bias=float(error.mean()) if len(error) else float("nan"),
-            rmse=_rms(error),
-            nmad=_nmad(error),
-            rms_per_bound=_rms(error / bound),
-            nmad_per_bound=_nmad(error / bound),
-            calibration=_rms(scaled),
-            calibration_nmad=_nmad(scaled),
-        )
+        spreads: list[float] = []
+        for values in (error, error / bound, scaled):
+            spreads += [float(np.sqrt(np.mean(np.square(values)))), robust_std(values)] if len(values) else [np.nan] * 2
+        return cls(len(error), float(error.mean()) if len(error) else np.nan, *spreads)
 
 
 def find_isolated_echoes(truth: EchoTable) -> np.ndarray:
@@ -187,11 +181,3 @@ def find_isolated_echoes(truth: EchoTable) -> np.ndarray:
     bad[1:] |= close
     bad[:-1] |= close
     return ~bad
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
-
-
-def _nmad(values: np.ndarray) -> float:
-    return robust_std(values) if len(values) else float("nan")

@@ -173,11 +173,22 @@ def _choose_radius(xyz: np.ndarray) -> float:
     if len(xyz) <= number:
         return RADII[0]
     some, around = xyz[:: max(len(xyz) // 500, 1)], Surroundings(xyz)
-    reach = RADII[0]
-    needed = _find_distance(around, some, number, reach)
+    # Distance within which nine tenths of some points have so many points, with themselves; far beyond `reach` where
+    # that is not enough.
+    reach, needed = 0.5 * RADII[0], np.inf
     while needed > reach and reach < RADII[1]:
         reach = min(2 * reach, RADII[1])
-        needed = _find_distance(around, some, number, reach)
+        point, offset = around.find(some, reach)
+        x, y, z = offset.T
+        square = x * x + y * y + z * z
+        order = np.argsort(square)
+        # There are at most 1,000 points.
+        square = square[order[np.argsort(point[order].astype(np.int16), kind="stable")]]
+        last = np.searchsorted(point, np.arange(len(some))) + number - 1
+        near = np.bincount(point, minlength=len(some)) >= number
+        distance = np.full(len(some), 1e9)
+        distance[near] = np.sqrt(square[last[near]])
+        needed = float(np.quantile(distance, 0.9))
     radius = float(np.clip(np.ceil(10.0 * needed) / 10.0, *RADII))
     while radius < RADII[1]:
         # Points whose neighbours lie on two scan lines, seen from above, have no angle.
@@ -186,21 +197,6 @@ def _choose_radius(xyz: np.ndarray) -> float:
             break
         radius = min(round(radius + WIDER, 1), RADII[1])
     return radius
-
-
-def _find_distance(around: Surroundings, some: np.ndarray, number: int, reach: float) -> float:
-    """Distance within which nine tenths of some points have so many points, with themselves; far beyond `reach` where
-    that is not enough."""
-    point, offset = around.find(some, reach)
-    x, y, z = offset.T
-    square = x * x + y * y + z * z
-    order = np.argsort(square)
-    square = square[order[np.argsort(point[order].astype(np.int16), kind="stable")]]  # there are at most 1,000 points
-    last = np.searchsorted(point, np.arange(len(some))) + number - 1
-    near = np.bincount(point, minlength=len(some)) >= number
-    distance = np.full(len(some), 1e9)
-    distance[near] = np.sqrt(square[last[near]])
-    return float(np.quantile(distance, 0.9))
 
 
 def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_waveforms: int) -> Iterator[Slopes]:
@@ -287,7 +283,12 @@ def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
     if len(variance) < ENOUGH_TO_LEARN:
         return replace(system, widths=replace(system.widths, error=np.inf))
     # The survey's pulse may include slopes, so the true one can be narrower, but never wider.
-    level, level_err = _find_mode(variance), float(np.median(error))
+    # Centre of the shortest interval that holds a third of the values, which slopes and plants do not move.
+    ordered = np.sort(variance.astype(np.float64))
+    hold = max(len(ordered) // 3, 2)
+    span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
+    first = int(np.argmin(span))
+    level, level_err = float(np.median(ordered[first : first + hold])), float(np.median(error))
     for _ in range(ROUNDS):
         near = np.abs(variance - level) < 2.0 * error
         if np.count_nonzero(near) < ENOUGH_TO_LEARN:
@@ -353,15 +354,6 @@ def _fit_divergence(
         return None, 0.0
     relative = float(np.hypot(0.5 * spread**-0.5 / square, LEAST_DIVERGENCE_ERROR))
     return (None, 0.0) if relative > LARGEST_DIVERGENCE_ERROR else (1e3 * float(np.sqrt(square)), relative)
-
-
-def _find_mode(values: np.ndarray) -> float:
-    """Centre of the shortest interval that holds a third of the values, which slopes and plants do not move."""
-    ordered = np.sort(values.astype(np.float64))
-    hold = max(len(ordered) // 3, 2)
-    span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
-    first = int(np.argmin(span))
-    return float(np.median(ordered[first : first + hold]))
 
 
 SLOPE = 30.0

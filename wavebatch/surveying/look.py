@@ -252,11 +252,6 @@ def kind_of(block: WaveformBlock) -> Kind:
     return Kind(float(digitizer.bits), digitizer.spacing, digitizer.gain, digitizer.offset)
 
 
-def list_kinds(blocks: Iterable[WaveformBlock]) -> dict[int, Kind]:
-    """Return how the samples of each descriptor of blocks were made, by its index."""
-    return {block.digitizer.index: kind_of(block) for block in blocks}
-
-
 def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
     """Return what a surveyed flight records, and its descriptors; raises ConfigError for a survey of no flight."""
     look, kinds = survey.figures.look, survey.figures.kinds

@@ -582,19 +582,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     xyz += velocity * (time - inside)[:, None]
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
     distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
-    error, facts = _overall_error(found, rays), _describe(found, path, rays)
-    source = SensorSource(kind, path, distance=distance, error=error, facts=facts)
-    if pairs is None:
-        return source
-    shown, turn, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
-    back = np.cross(rays.direction, turn)
-    straight = rays._replace(direction=rays.direction + back + 0.5 * np.cross(back, turn))
-    source = (estimate_path(straight, kind) if turn.any() else None) or source
-    return replace(source, error=float(np.hypot(source.error, off)), facts=(*source.facts, *shown.items()))
-
-
-def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: RaySample) -> float:
-    """Root mean square of the range's error over all windows [m]: what the fits say, and what they contradict."""
+    # The range's error over all windows: what the fits say, and what they contradict.
     squares, apart = [], []
     for number, (fit, _, within) in enumerate(found):
         near = np.abs(rays.time - fit.centre) <= fit.half
@@ -614,7 +602,15 @@ def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: 
         motion = 0.5 * np.mean(apart)  # both windows are off
     else:
         motion = (JERK * JERK_LEFT * max(fit.half for fit, _, _ in found) ** 3) ** 2
-    return float(np.sqrt(np.mean(squares) + motion))
+    error, facts = float(np.sqrt(np.mean(squares) + motion)), _describe(found, path, rays)
+    source = SensorSource(kind, path, distance=distance, error=error, facts=facts)
+    if pairs is None:
+        return source
+    shown, turn, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
+    back = np.cross(rays.direction, turn)
+    straight = rays._replace(direction=rays.direction + back + 0.5 * np.cross(back, turn))
+    source = (estimate_path(straight, kind) if turn.any() else None) or source
+    return replace(source, error=float(np.hypot(source.error, off)), facts=(*source.facts, *shown.items()))
 
 
 def _describe(

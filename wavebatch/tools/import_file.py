@@ -337,17 +337,14 @@ def _learn_outgoing(samples: dict[int, list[tuple[np.ndarray, np.ndarray]]]) -> 
     energy, amplitude = pulses.energy[good], pulses.amplitude[good]
     error = float((pulses.energy_error[good] / energy).mean())
     _, _, spacing, _ = decode(code)
+    shape_error = float(np.hypot(error, (pulses.amplitude_error[good] / amplitude).mean()))
+    # Relative scatter of energies and shapes beyond their relative errors.
+    beyond = [float(np.sqrt(max((values.std() / values.mean()) ** 2 - own**2, 0.0)))
+              for values, own in ((energy, error), (energy / amplitude, shape_error))]  # fmt: skip
     return Outgoing(
         code & ~((1 << 18) - 1), reference, learn_shape(values, spacing, reference), float(energy.mean()),
-        float(amplitude.mean()), _beyond(energy, error), error,
-        _beyond(energy / amplitude, float(np.hypot(error, (pulses.amplitude_error[good] / amplitude).mean()))),
-        float((start + pulses.time)[good].mean()),
+        float(amplitude.mean()), beyond[0], error, beyond[1], float((start + pulses.time)[good].mean()),
     )  # fmt: skip
-
-
-def _beyond(values: np.ndarray, error: float) -> float:
-    """Relative scatter of values beyond their relative error."""
-    return float(np.sqrt(max((values.std() / values.mean()) ** 2 - error**2, 0.0)))
 
 
 # The second pass: packets and points
@@ -584,7 +581,22 @@ class Overlaps:
             x -= np.percentile(x, 25, axis=1, keepdims=True)
             y -= np.percentile(y, 25, axis=1, keepdims=True)
             shift = (segments.start[b] - segments.start[a]) * segments.unit[a] / segments.spacing[a]
-            other = _interpolate(y, np.arange(x.shape[1]) - shift[:, None])
+            # Values between samples by Lagrange's cubic; NaN outside.
+            # A straight line would lift flanks, and with them the other channel: by 5 % for pulses of two samples.
+            place = np.arange(x.shape[1]) - shift[:, None]
+            at = np.floor(place).astype(np.int64)
+            part = place - at
+            inside = (at >= 1) & (at < y.shape[1] - 2)
+            at = np.clip(at, 1, max(y.shape[1] - 3, 1))
+            weights = (
+                -part * (part - 1) * (part - 2) / 6,
+                (part + 1) * (part - 1) * (part - 2) / 2,
+                -(part + 1) * part * (part - 2) / 2,
+                (part + 1) * part * (part - 1) / 6,
+            )
+            rows, last = np.arange(len(y))[:, None], y.shape[1] - 1
+            found = sum(weight * y[rows, np.minimum(at + k - 1, last)] for k, weight in enumerate(weights))
+            other = np.where(inside, found, np.nan)
             inside = np.isfinite(other)
             self.products.append((x[inside], other[inside]))
 
@@ -597,26 +609,6 @@ class Overlaps:
         if np.count_nonzero(used) < LEAST_SAMPLES:
             return None
         return float((x[used] * y[used]).sum() / (y[used] ** 2).sum())
-
-
-def _interpolate(values: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Values (n, s) at places (n, k) between samples, by Lagrange's cubic; NaN outside.
-
-    A straight line would lift flanks, and with them the other channel: by 5 % for pulses of two samples.
-    """
-    at = np.floor(place).astype(np.int64)
-    part = place - at
-    inside = (at >= 1) & (at < values.shape[1] - 2)
-    at = np.clip(at, 1, max(values.shape[1] - 3, 1))
-    weights = (
-        -part * (part - 1) * (part - 2) / 6,
-        (part + 1) * (part - 1) * (part - 2) / 2,
-        -(part + 1) * part * (part - 2) / 2,
-        (part + 1) * part * (part - 1) / 6,
-    )
-    rows, last = np.arange(len(values))[:, None], values.shape[1] - 1
-    found = sum(weight * values[rows, np.minimum(at + k - 1, last)] for k, weight in enumerate(weights))
-    return np.where(inside, found, np.nan)
 
 
 # Coordinates

@@ -563,8 +563,9 @@ class Breakdown:
         self._count("return", code[numbered], alone[numbered])
         self._count("class", rows["classification"], alone)
         known = ~np.isnan(rows["amplitude"])
-        self._count("amplitude", _octave(rows["amplitude"][known]), alone[known])
-        self._count("intensity", _octave(rows["intensity"]), alone)
+        for kind, kept in (("amplitude", known), ("intensity", slice(None))):
+            values = np.clip(rows[kind][kept].astype(np.float64), 0.0, 1e9)
+            self._count(kind, np.clip(np.frexp(values)[1], 0, _OCTAVES - 1).astype(np.int64), alone[kept])
         if others is not None:
             self._count("pulse", (others > 0).astype(np.int64), alone)
         flags = [*((rows["flags"] & np.uint16(flag)) != 0 for flag in EchoFlag), rows["flags"] == 0]
@@ -592,8 +593,3 @@ class Breakdown:
         if set(tables["class"]) <= {name_class(0)}:
             del tables["class"]
         return {kind: table for kind, table in tables.items() if table}
-
-
-def _octave(values: np.ndarray) -> np.ndarray:
-    """Classes of amplitudes: 0 below 1, 1 from 1 to 2, 2 from 2 to 4 ..., i8 (k,)."""
-    return np.clip(np.frexp(np.clip(values.astype(np.float64), 0.0, 1e9))[1], 0, _OCTAVES - 1).astype(np.int64)

@@ -129,16 +129,11 @@ class PolygonSet(Division):
         return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
 
-def name_ranks(number: int) -> tuple[str, ...]:
-    """Names of so many classes of pairs of consecutive returns.
+RANKS = ("1-2", "2-3", "3-4", "4-")
+"""Classes of pairs of consecutive returns per area and of dead zones.
 
-    They count by the number of the first return; the last class holds all higher numbers.
-    """
-    return (*(f"{k}-{k + 1}" for k in range(1, number)), f"{number}-")
-
-
-RANKS = name_ranks(4)
-"""Classes of pairs per area and of dead zones."""
+They count by the number of the first return; the last class holds all higher numbers.
+"""
 
 
 @frozen
@@ -341,7 +336,7 @@ def find_dead_zone(bins: np.ndarray) -> DeadZone:
     return DeadZone(pairs, round(edge * BIN, 2), round(max(rank * gap, BIN), 3))
 
 
-_RANKS = name_ranks(15)
+_RANKS = (*(f"{k}-{k + 1}" for k in range(1, 15)), "15-")
 """Classes of pairs of whole clouds."""
 
 _NOT_A_TIME = np.uint64(0x7FF8 << 48)

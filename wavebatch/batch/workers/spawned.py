@@ -174,19 +174,19 @@ def _as_children(needs_main: bool) -> Iterator[None]:
     script either: multiprocessing finds an empty one.
     """
     main, variables = sys.modules["__main__"], {name: os.environ[name] for name in CHILD if name in os.environ}
-    can_mask = hasattr(signal, "pthread_sigmask")
-    if can_mask:
-        resource_tracker.ensure_running()  # the start of the first process would do it, and let the signals through
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before: set[Any] | None = None
     try:
         os.environ.update(CHILD)
+        if hasattr(signal, "pthread_sigmask"):
+            resource_tracker.ensure_running()  # the start of the first process would do it, and let the signals through
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         if not needs_main:
             sys.modules["__main__"] = types.ModuleType("__main__")
         yield
     finally:
         sys.modules["__main__"] = main
+        if before is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for name in CHILD:
             os.environ.pop(name, None)
         os.environ.update(variables)
-        if can_mask:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -178,7 +178,7 @@ class CloudReader(Closing):
             "classification": las.read_classes,
             **({"echo_flags": self.read_flags} if self.has_flags else {}),
         }
-        return chosen.plan(standard, self.find_value, str(self.path))
+        return chosen.plan(standard, lambda column: self.find_column(column)[1], str(self.path))
 
     def select(self, chosen: PointFilter) -> None:
         """Let the reader give only the points that a filter chooses; raises as `plan`."""
@@ -218,14 +218,6 @@ class CloudReader(Closing):
         """Return the names of all columns of the file."""
         standard = [name for name in las.list_dimensions(self.point_format) if name not in ("X", "Y", "Z")]
         return [*self.extra, "x", "y", "z", *standard]
-
-    def find_value(self, column: str) -> ReadColumn:
-        """Return the function from raw records (n,) to the values of a column (n,), NaN for no data.
-
-        Positions are in the unit of the file, also after `measure_in_metres`. It also works after the file is closed.
-        Raises ConfigError if there is no such column.
-        """
-        return self.find_column(column)[1]
 
     def find_column(self, column: str | None, *, stored: bool = False) -> tuple[ColumnFacts, ReadColumn]:
         """Return facts and reading function of a column; stored: its name is that in the file."""

@@ -68,11 +68,6 @@ class Naming:
     """Written as 10 log10 of the value."""
 
 
-def _in_camel_case(*columns: str) -> dict[str, Naming]:
-    """Columns named like EchoWidth."""
-    return {column: Naming(column.title().replace("_", "")) for column in columns}
-
-
 STYLES: dict[str, dict[str, Naming]] = {
     "wavebatch": {},
     # Of the standard extra bytes of ASPRS one is a wavebatch column: pulse width, full width at half maximum in ns.
@@ -84,11 +79,11 @@ STYLES: dict[str, dict[str, Naming]] = {
     },
     # PDAL's Amplitude is in dB and its PulseWidth in samples of the digitizer, so these two names are not used.
     "pdal": {
-        **_in_camel_case(
+        **{name: Naming(name.title().replace("_", "")) for name in (
             "echo_time", "echo_width", "energy", "cross_section", "backscatter_coefficient", "incidence_angle",
             "incidence_angle_normals", "echo_width_err", "incidence_angle_err", "incidence_angle_normals_err",
             "echo_flags",
-        ),
+        )},
         "amplitude": Naming("PeakAmplitude"),
         "amplitude_err": Naming("PeakAmplitudeErr"),
         "range": Naming("EchoRange"),
@@ -97,9 +92,9 @@ STYLES: dict[str, dict[str, Naming]] = {
         "reflectance": Naming("Reflectance", unit="dB", decibel=True),
         "pulse_deviation": Naming("PulseShapeDeviation"),
     },
-    "opals": _in_camel_case(
+    "opals": {name: Naming(name.title().replace("_", "")) for name in (
         "amplitude", "echo_width", "range", "cross_section", "backscatter_coefficient", "reflectance"
-    ),
+    )},
 }  # fmt: skip
 """Columns that a style names differently; all other columns keep wavebatch's name, type and unit."""
 

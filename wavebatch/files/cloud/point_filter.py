@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.condition import Condition, parse_condition, read_flags
-from wavebatch.core.echoes import COLUMNS, EchoFlag
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
 from wavebatch.files.geojson import Polygon, describe_miss, find_inside, load_polygons
@@ -150,11 +150,6 @@ class PointFilter:
         areas = [[ring for polygon in self.polygons for ring in polygon.rings]]
         areas += [] if self.bbox is None else [[np.array(self.bbox).reshape(2, 2)]]
         return next(filter(None, (describe_miss(area, header) for area in areas if area)), "")
-
-    def list_wanted(self) -> tuple[str, ...]:
-        """Return the wavebatch columns that --where names exactly, so that the chain gets their stages."""
-        named = () if self.where is None else self.where.columns
-        return tuple(name for name in named if name in COLUMNS and COLUMNS[name].extra_bytes)
 
 
 EVERY = PointFilter()

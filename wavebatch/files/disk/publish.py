@@ -165,19 +165,17 @@ _CLAIM_PATIENCE = 0.5
 _NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EINVAL}
 
 
+_REMEDIES: dict[int | None, str] = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "free space or choose another output folder"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "check the folder's permissions"),
+    errno.ENOENT: "make the folder first",
+}
+
+
 def reporting(target: Path) -> contextlib.AbstractContextManager[None]:
     """Turn an error of the operating system while `target` is written into one InputError line."""
-    return in_one_line(lambda error, why: f"{target}: cannot be written: {why}; {_remedy(error)}")
-
-
-def _remedy(error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "free space or choose another output folder"
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return "check the folder's permissions"
-    if error.errno == errno.ENOENT:
-        return "make the folder first"
-    return "choose another output folder"
+    remedy = lambda error: _REMEDIES.get(error.errno, "choose another output folder")  # noqa: E731
+    return in_one_line(lambda error, why: f"{target}: cannot be written: {why}; {remedy(error)}")
 
 
 class Draft(contextlib.AbstractContextManager):
@@ -193,7 +191,7 @@ class Draft(contextlib.AbstractContextManager):
         self.target = Path(target)
         self.overwrite = overwrite
         if is_stream(self.target):
-            raise InputError(_no_file(self.target))
+            raise InputError(_refusal(self.target))
         check_target(self.target, overwrite=True)
         if self.target.parent not in _cleared:
             _cleared.add(self.target.parent)
@@ -221,10 +219,18 @@ class Draft(contextlib.AbstractContextManager):
                 if self.overwrite:
                     os.replace(self.path, self.target)
                 else:
-                    _link(self.path, self.target)
+                    # Two processes may do it at once: the second name is given to one file only.
+                    try:
+                        os.link(self.path, self.target)
+                    except OSError as error:
+                        if error.errno not in _NO_LINKS:
+                            raise
+                        # No hard links here: only one process can create this empty file, so it reserves the name.
+                        os.close(os.open(self.target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+                        os.replace(self.path, self.target)
             except FileExistsError:
                 if not (same_is_fine and filecmp.cmp(self.path, self.target, shallow=False)):
-                    raise InputError(_exists(self.target)) from None
+                    raise InputError(_refusal(self.target)) from None
             else:
                 self.published = True
             # The new name survives a power cut; Windows cannot open folders, some file systems cannot sync them.
@@ -290,7 +296,7 @@ def check_target(target: Path, *, overwrite: bool) -> None:
 def refuse_existing(target: Path, overwrite: bool = False) -> None:
     """Raise InputError if something of that name exists, without `overwrite`; publishing checks again."""
     if not overwrite and os.path.lexists(target):
-        raise InputError(_exists(target))
+        raise InputError(_refusal(target))
 
 
 def publish_together(drafts: Sequence[Draft]) -> None:
@@ -333,7 +339,14 @@ class Claim:
         with uninterrupted(), reporting(folder):
             while self._descriptor is None:
                 try:
-                    self._descriptor = _lock(self._path)
+                    # None if the file was removed meanwhile.
+                    descriptor, held = os.open(self._path, LOCK_FLAGS | os.O_CREAT, 0o666), False
+                    try:
+                        held = hold(descriptor)
+                    finally:
+                        if not held:
+                            os.close(descriptor)
+                    self._descriptor = descriptor if held else None
                 except BlockingIOError:  # `remove_stale` may hold it for an instant
                     if time.monotonic() > deadline:
                         what = "another run makes this output now; wait for that run, or choose another folder"
@@ -349,17 +362,6 @@ class Claim:
             os.close(self._descriptor)
             self._descriptor = None
         _open.discard(self)
-
-
-def _lock(path: Path) -> int | None:
-    """A descriptor of the locked file; None if it was removed meanwhile. BlockingIOError if another process has it."""
-    descriptor, held = os.open(path, LOCK_FLAGS | os.O_CREAT, 0o666), False
-    try:
-        held = hold(descriptor)
-    finally:
-        if not held:
-            os.close(descriptor)
-    return descriptor if held else None
 
 
 def list_names(folder: Path, begins: tuple[str, ...], end: str = "") -> list[Path]:
@@ -383,29 +385,14 @@ def remove_stale(folder: Path) -> list[Path]:
     return remove_unlocked(found, lambda path: os.open(path, LOCK_FLAGS), os.unlink)
 
 
-def _no_file(target: Path) -> str:
-    return f"{target}: is a device or a pipe, but this output must be a regular file; choose another name"
-
-
-def _exists(target: Path) -> str:
-    if is_stream(target):
-        return _no_file(target)
-    return f"{target}: exists already; choose another output or replace it with --overwrite"
-
-
 def _create(folder: Path) -> tuple[Path, int]:
     """A new file, open for reading and writing."""
     path = folder / f"{_PREFIX}{os.getpid()}-{os.urandom(6).hex()}{_SUFFIX}"
     return path, os.open(path, LOCK_FLAGS | os.O_CREAT | os.O_EXCL, 0o666)
 
 
-def _link(path: Path, target: Path) -> None:
-    """Gives the file the second name `target`, or raises FileExistsError; safe if two processes do it at once."""
-    try:
-        os.link(path, target)
-    except OSError as error:
-        if error.errno not in _NO_LINKS:
-            raise
-        # No hard links here: only one process can create this empty file, so it reserves the name.
-        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-        os.replace(path, target)
+def _refusal(target: Path) -> str:
+    """Why no file of this name, which there is, is written."""
+    if is_stream(target):
+        return f"{target}: is a device or a pipe, but this output must be a regular file; choose another name"
+    return f"{target}: exists already; choose another output or replace it with --overwrite"

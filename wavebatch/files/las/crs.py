@@ -314,7 +314,9 @@ def read_wkt(text: str) -> list[Node]:
 LONGEST_WKT = 1 << 20
 """Longest record that is read as a WKT: those of real files have a few kilobytes."""
 
-_METRE_UNIT = re.compile(r'UNIT\s*[\[(]\s*"(?:met(?:er|re)s?|m)"\s*,\s*([-+0-9.eE]+)\s*[,\])]', re.IGNORECASE)
+_METRE_UNIT = re.compile(
+    r'UNIT\s*[\[(]\s*"(?:met(?:er|re)s?|m)"\s*,\s*\+?0*1(?:\.0*)?(?:E[-+]?0+)?\s*[,\])]', re.IGNORECASE
+)
 _DEGREE = 'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]]'
 
 
@@ -337,8 +339,7 @@ def repair_wkt(wkt: str) -> str:
         if len(units) != 1:
             continue
         start, end = units[0].start, units[0].end
-        found = _METRE_UNIT.match(wkt, start, end)
-        if found and _is_one(found[1]):
+        if _METRE_UNIT.match(wkt, start, end):
             repaired = repaired[:start] + _DEGREE + repaired[end:]
     return wkt if repaired == wkt else drop_empty_codes(repaired)
 
@@ -346,13 +347,6 @@ def repair_wkt(wkt: str) -> str:
 def drop_empty_codes(wkt: str) -> str:
     """Return a WKT without the code 0 of RiPROCESS: GDAL looks it up in vain, and a GeoTIFF then has no projection."""
     return re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", wkt)
-
-
-def _is_one(number: str) -> bool:
-    try:
-        return float(number) == 1.0
-    except ValueError:
-        return False
 
 
 def repair_records(vlrs: Iterable[las.Vlr]) -> list[las.Vlr]:
@@ -536,7 +530,10 @@ def parse_wkt(text: str) -> CrsUnits:
     if not found:
         return CrsUnits()
     root = found[0]
-    systems = [_unwrap(node) for node in (root.nodes if root.word in _COMPOUND else [root])]
+    systems = []
+    for node in root.nodes if root.word in _COMPOUND else [root]:
+        source = node.find("SOURCECRS") if node.word == "BOUNDCRS" else None
+        systems.append(source.nodes[0] if source is not None and source.nodes else node)
     upright = next((node for node in systems if node.word in _UPRIGHT), None)
     vertical = None if upright is None else _find_unit(upright)
     for node in systems:
@@ -550,12 +547,6 @@ def parse_wkt(text: str) -> CrsUnits:
             vertical = _find_unit(node, last=True) if vertical is None else vertical
             return CrsUnits("projected", _find_unit(node), vertical)
     return CrsUnits(None, None, vertical)
-
-
-def _unwrap(node: Node) -> Node:
-    """The source CRS of a bound CRS, or the node itself."""
-    source = node.find("SOURCECRS") if node.word == "BOUNDCRS" else None
-    return source.nodes[0] if source is not None and source.nodes else node
 
 
 def _find_unit(node: Node, *, last: bool = False) -> float | None:

@@ -177,7 +177,8 @@ class PointFile(contextlib.AbstractContextManager):
         header.point_length = dtype.itemsize
         header.vlrs = [vlr for vlr in header.vlrs if not las.has_record([vlr], "laszip encoded", 22204)]
         self._place_extra_bytes()
-        self._statistics = Statistics(dtype, self._records)
+        self.statistics = Statistics(dtype, self._records)
+        """Of all rows; those of rows that `append` writes are joined to it."""
         refuse_existing(self.target, overwrite)
         self.draft = Draft(self.target, overwrite=overwrite)
         self.drafts = [self.draft]
@@ -194,12 +195,8 @@ class PointFile(contextlib.AbstractContextManager):
             raise InputError(f"{self.target}: rows of another layout than the file's; this is a bug, please report it")
         if len(rows):
             rows = np.ascontiguousarray(rows)
-            self._statistics.add(rows)
+            self.statistics.add(rows)
             self._write(self._encoder.write, rows)
-
-    def count_rows(self, statistics: Statistics) -> None:
-        """Count rows of `dtype` that `append` writes."""
-        self._statistics.join(statistics)
 
     def append(self, chunk: Chunk) -> None:
         """Append rows of `dtype` as they stand in the file; of LAZ CHUNK_POINTS each time, but for the last."""
@@ -207,18 +204,12 @@ class PointFile(contextlib.AbstractContextManager):
 
     def _write(self, write: Callable[[Any], None], what: Any) -> None:
         interrupts.check()
-        if self._statistics.count >= 2**32 and self._header.version < (1, 4):
+        if self.statistics.count >= 2**32 and self._header.version < (1, 4):
             version = "{}.{}".format(*self._header.version)
             raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --las-version 1.4")
         with self._guarded():
             write(what)
             self.draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
-
-    def finish_points(self) -> None:
-        """End the points; extended records may follow."""
-        with self._guarded():
-            self._encoder.finish()
-            self.draft.file.seek(0, 2)
 
     def append_record(self, head: bytes, source: BinaryIO, start: int, end: int, *, waveforms: bool = False) -> None:
         """Append an extended record: the 60 bytes of `head`, then bytes [start, end) of `source`."""
@@ -232,14 +223,6 @@ class PointFile(contextlib.AbstractContextManager):
             self._header.evlr_start = self._header.evlr_start or at
             self._header.evlr_count += 1
 
-    def finish(self) -> None:
-        """Write the final header; the draft is then ready to be published."""
-        self._statistics.fill(self._header)
-        self._place_extra_bytes(self._statistics.ranged())
-        with self._guarded():
-            self.draft.file.seek(0)
-            self.draft.file.write(self._header.encode())
-
     def commit(self) -> None:
         """Complete and publish the file with all that belongs to it; on an error nothing of it remains."""
         self.complete()
@@ -248,10 +231,15 @@ class PointFile(contextlib.AbstractContextManager):
     def complete(self) -> int:
         """Complete the file under its temporary name, and return its size; on an error nothing of it remains."""
         with undoing(self.abort):
-            self.finish_points()
-            self._append_records()
-            self.finish()
             with self._guarded():
+                self._encoder.finish()
+                self.draft.file.seek(0, 2)
+            self._append_records()
+            self.statistics.fill(self._header)
+            self._place_extra_bytes(self.statistics.ranged())
+            with self._guarded():
+                self.draft.file.seek(0)
+                self.draft.file.write(self._header.encode())
                 return self.draft.file.seek(0, 2)
 
     def publish(self, *more: Draft) -> None:

@@ -549,12 +549,6 @@ SomePackets = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Packets of a unit: the key of each (see `Judged.keys`), its samples and whether they are packed."""
 
 
-def take_some(judged: Judged, rows: np.ndarray, most: int = SAMPLED_PER_UNIT) -> SomePackets:
-    """Return some of the packets of a unit; rows: points with different packets, ordered by byte offset."""
-    rows = rows[even_places(len(rows), most)]
-    return judged.keys[rows], judged.n_samples[rows], judged.packed[rows]
-
-
 @changeable
 class _Votes:
     """Waveforms whose signal goes up, and down; moments of all deviations from the medians."""

@@ -162,8 +162,11 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
         raise refuse_compressed(path, next(iter(compression.values())))
     if header.global_encoding & las.WAVES_INTERNAL:
         return _locate_internal(checked)
-    packet_file, external = _find_packet_file(path), header.global_encoding & las.WAVES_EXTERNAL
-    packed = _find_packet_file(path, "wdz")
+    external = header.global_encoding & las.WAVES_EXTERNAL
+    packet_file, packed = (
+        next(filter(Path.is_file, list_packet_files(path, (f".{end}", f".{end.upper()}"))), None)
+        for end in ("wdp", "wdz")
+    )
     if COMPRESSED in compression.values() and packed is not None:
         packet_file = packed
     warning = "the header does not give the place of the packets (global encoding bits 1 and 2)"
@@ -192,11 +195,6 @@ def refuse_compressed(path: Path, kind: int) -> InputError:
         f"{path}: its packets are compressed (type {kind}), which LAS does not define; wavebatch reads type 1 with 8 "
         f"or 16 bits; decompress them first: laszip -i {path.name} -o {path.stem}_raw.las -waveform"
     )
-
-
-def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
-    found = list_packet_files(path, (f".{suffix}", f".{suffix.upper()}"))
-    return next(filter(Path.is_file, found), None)
 
 
 def _locate_internal(checked: CheckedHeader) -> PacketPlace:

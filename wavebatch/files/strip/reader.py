@@ -481,7 +481,14 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
         number = int(np.clip(np.ceil(seconds / SLICE_SECONDS), 1, share)) if np.isfinite(seconds) else share
         for edge in (start + np.arange(1, number) * ((stop - start) // number)).tolist():
             take(edge, min(edge + SLICE_POINTS, stop))
-    return _join(kept), _join(pairs)
+    samples = []
+    for parts in (kept, pairs):
+        columns = [np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3))]
+        if parts:
+            columns = [np.concatenate(values) for values in zip(*parts, strict=True)]
+        order = np.argsort(columns[0], kind="stable")
+        samples.append(RaySample(*(values[order] for values in columns)))
+    return samples[0], samples[1]
 
 
 def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
@@ -515,11 +522,3 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
     borders = scan.borders
     chosen = even_places(len(borders) - 1, MOST_SLICES)
     return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
-
-
-def _join(parts: list[RaySample]) -> RaySample:
-    if not parts:
-        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3)))
-    joined = [np.concatenate(values) for values in zip(*parts, strict=True)]
-    order = np.argsort(joined[0], kind="stable")
-    return RaySample(*(values[order] for values in joined))

@@ -21,7 +21,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import changeable, frozen
-from wavebatch.core.order import distinct
+from wavebatch.core.order import distinct, even_places
 from wavebatch.files.disk.raw_bytes import Closing, join_records, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
@@ -210,7 +210,14 @@ def find_far(
             spool.append(spread_keys(keys, buckets), entries)
         spool.seal()
         for bucket in range(buckets):
-            entries = _read_bucket(spool, bucket)
+            # In file order; of overfull packets only the first entries, enough to know them.
+            entries = np.empty(0, _KEY)
+            for part in spool.pieces(bucket):
+                entries = np.concatenate([entries, part])
+                groups = group_keys(entries["key"])
+                if (groups.counts > MAX_RETURNS + 1).any():
+                    keep = groups.order[expand(groups.starts, np.minimum(groups.counts, MAX_RETURNS + 1))]
+                    entries = entries[np.sort(keep)]
             groups = group_keys(entries["key"])
             packets += len(groups.starts)
             if len(entries):
@@ -223,18 +230,6 @@ def find_far(
             asked["index"], asked["unit"] = entries["index"][member], target
             wants.append(unit[member], asked)
     return wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull])
-
-
-def _read_bucket(spool: Spool, bucket: int) -> np.ndarray:
-    """Entries of a bucket in file order; of overfull packets only the first ones, enough to know them."""
-    held = np.empty(0, _KEY)
-    for part in spool.pieces(bucket):
-        held = np.concatenate([held, part])
-        groups = group_keys(held["key"])
-        if (groups.counts > MAX_RETURNS + 1).any():
-            keep = groups.order[expand(groups.starts, np.minimum(groups.counts, MAX_RETURNS + 1))]
-            held = held[np.sort(keep)]
-    return held
 
 
 @frozen(eq=False)
@@ -551,12 +546,13 @@ class Scanner:
         judged = self._judge.judge(points, self._form)
         self._found.tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
-        near = self._window.tail(start - self._sizes.window).join(judged.keys[rows], start + rows, unit, points)
+        near = self._window.follow(start - self._sizes.window, judged.keys[rows], start + rows, unit, points)
         own = near.index >= start
         groups = self._found.near.add(near.keys, near.index, near.unit, own, lambda rows: self._entries(near, rows))
         first = groups.order[groups.starts] - (len(near.keys) - len(rows))
         new = rows[first[first >= 0]]
-        self._found.sample.append(check.take_some(judged, new, max(check.SAMPLED_PER_UNIT // self._thinning, 1)))
+        some = new[even_places(len(new), max(check.SAMPLED_PER_UNIT // self._thinning, 1))]
+        self._found.sample.append((judged.keys[some], judged.n_samples[some], judged.packed[some]))
         width = np.take(self._widths, points["wavepacket_index"][new])
         self._found.claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
@@ -627,17 +623,15 @@ class _Near:
         """Returns the records of the usable points `rows`."""
         return take_whole_records(self.points, self.index[rows] - self.start)
 
-    def tail(self, least: int) -> _Near:
-        """The part from file index `least` on; a copy, which frees memory."""
-        at, first = int(np.searchsorted(self.index, least)), max(self.start, least)
-        keys, index, unit = (part[at:].copy() for part in (self.keys, self.index, self.unit))
-        return _Near(keys, index, unit, self.points[first - self.start :].copy(), first)
+    def follow(self, least: int, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray) -> _Near:
+        """The part from file index `least` on, a copy, which frees memory, and the points that follow.
 
-    def join(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray) -> _Near:
-        """With the points that follow, all of one unit, of which those at `index` are usable."""
-        keys, index = np.concatenate([self.keys, keys]), np.concatenate([self.index, index])
-        units = np.append(self.unit, np.full(len(keys) - len(self.unit), unit))
-        return _Near(keys, index, units, join_records(self.points, points), self.start)
+        These are all of one unit; those at `index` are usable.
+        """
+        at, first = int(np.searchsorted(self.index, least)), max(self.start, least)
+        keys, index = np.concatenate([self.keys[at:], keys]), np.concatenate([self.index[at:], index])
+        units = np.append(self.unit[at:], np.full(len(keys) - len(self.unit[at:]), unit))
+        return _Near(keys, index, units, join_records(self.points[first - self.start :].copy(), points), first)
 
 
 def _find_cut(rest: np.ndarray, part: np.ndarray) -> int:

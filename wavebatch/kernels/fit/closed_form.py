@@ -130,14 +130,12 @@ def start_errors(amplitude: np.ndarray, width: np.ndarray, std: np.ndarray) -> t
     by_width = spread * spread / (width * determinant) * shape * (s0 * x * x - s2)
     by_height = shape * (s4 - s2 * x * x) / determinant - 0.5 / (width * spread) * by_width
     noise = std / amplitude * np.sqrt(spread) / width
-    return amplitude * noise * _filtered_norm(by_height), noise * _filtered_norm(by_width)
-
-
-def _filtered_norm(taps: np.ndarray) -> np.ndarray:
-    """Gain (m,) of white noise through the [1 2 1]/4 filter and then taps (5, m): root of the sum of squares."""
-    wide = np.pad(taps, ((2, 2), (0, 0)))
-    joined = (wide[:-2] + 2.0 * wide[1:-1] + wide[2:]) * 0.25
-    return np.sqrt(sum_samples(joined * joined))
+    gains = []
+    for taps in (by_height, by_width):  # gain of white noise through the [1 2 1]/4 filter and then these taps
+        wide = np.pad(taps, ((2, 2), (0, 0)))
+        joined = (wide[:-2] + 2.0 * wide[1:-1] + wide[2:]) * 0.25
+        gains.append(np.sqrt(sum_samples(joined * joined)))
+    return amplitude * noise * gains[0], noise * gains[1]
 
 
 def fit_parabola(weight: np.ndarray, x: np.ndarray, y: np.ndarray, axis: int) -> tuple[np.ndarray, ...]:

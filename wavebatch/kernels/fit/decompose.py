@@ -215,8 +215,9 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
     c = len(clusters.number)
     number, converged = np.zeros(c, np.int64), np.zeros(c, bool)
     cost = np.zeros(c)
-    room, done, parts = int(clusters.number.sum()) + c // 4 + 64, 0, []
-    while done < c:
+    parts: list[list[np.ndarray]] = []
+    room, done = int(clusters.number.sum()) + c // 4 + 64, 0
+    while done < c or not parts:
         echoes = np.empty(room), np.empty((room, 4)), np.empty((room, 4)), np.empty((room, 2)), np.empty(room, bool)
         columns = (number, converged, cost, *echoes)
         out = library.Echoes(room, *map(library.address, columns))
@@ -224,8 +225,7 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
         reached = call("decompose_clusters", *problem, ctypes.c_int64(done), out, ctypes.byref(found))
         parts.append([column[: found.value] for column in echoes])
         room, done = 2 * room, reached
-    joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)] if parts else _no_echoes()
-    return Solution(number, converged, cost, *joined)
+    return Solution(number, converged, cost, *(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, settings: Settings) -> np.ndarray:
@@ -236,10 +236,6 @@ def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, set
     promise = np.zeros(len(clusters.number))
     call("promise_echoes", *_as_problem(samples, echoes, clusters, settings), promise)
     return promise
-
-
-def _no_echoes() -> tuple[np.ndarray, ...]:
-    return np.empty(0), np.empty((0, 4)), np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool)
 
 
 def _as_problem(

@@ -218,7 +218,12 @@ def _as_structure(sums: Sums, noise: SampleNoise, change: float) -> library.CDes
         raise ValueError("the first echoes of the waveforms do not ascend to their number")
     if not np.isfinite(columns).all() or (columns[2] <= 0).any() or not noise.std > 0:
         raise ValueError("echoes must be finite, and widths and noise above 0")
-    ahead, left_over = _predict(noise.correlation)
+    # Factors of the last two samples that predict the next one best, and the share of the variance that they leave.
+    one, two = (*noise.correlation, 0.0, 0.0)[:2]
+    ahead, left_over, whole = (one, 0.0), LEAST_LEFT, 1.0 - one * one
+    if whole >= LEAST_LEFT:
+        ahead = one * (1.0 - two) / whole, (two - one * one) / whole
+        left_over = max(1.0 - ahead[0] * one - ahead[1] * two, LEAST_LEFT)
     pulse = as_pulse(sums.shape)
     structure = library.CDescribed(
         n, s, *(place(plane, np.float32) for plane in planes), place(used, np.bool_), place(first, np.int64),
@@ -227,13 +232,3 @@ def _as_structure(sums: Sums, noise: SampleNoise, change: float) -> library.CDes
     )  # fmt: skip
     structure.arrays = planes, used, first, columns, pulse
     return structure
-
-
-def _predict(correlation: tuple[float, ...]) -> tuple[tuple[float, float], float]:
-    """Factors of the last two samples that predict the next one best, and the share of the variance they leave."""
-    one, two = (*correlation, 0.0, 0.0)[:2]
-    whole = 1.0 - one * one
-    if whole < LEAST_LEFT:
-        return (one, 0.0), LEAST_LEFT
-    factors = one * (1.0 - two) / whole, (two - one * one) / whole
-    return factors, max(1.0 - factors[0] * one - factors[1] * two, LEAST_LEFT)

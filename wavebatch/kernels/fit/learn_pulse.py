@@ -88,7 +88,12 @@ def stack_pulse(
     least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
     lag = np.reshape(first, (-1, 1)) + np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
-    values = ((signal + _dither(time, signal.shape[1], std)) / amplitude[:, None])[used]
+    # Plus values spread evenly over one step of the counts, whose rounding has the standard deviation `std`: the median
+    # of whole counts is one of them, and so off by up to half a step, which gave pulses a tail of .5 %. They come from
+    # the times, so that the order of the echoes changes nothing.
+    fraction = time[:, None] * SCATTER[0] + np.arange(signal.shape[1]) * SCATTER[1]
+    fraction -= np.floor(fraction)
+    values = ((signal + ((fraction - 0.5) * (std * np.sqrt(12.0))).astype(np.float32)) / amplitude[:, None])[used]
     bins = np.floor((lag[used] + before) / step).astype(np.int64)
     if cut is not None:
         lost = cut[used]
@@ -99,17 +104,6 @@ def stack_pulse(
     kept = np.flatnonzero(number >= LEAST_BIN)
     error = MEDIAN_ERROR * np.maximum(spread[kept], least) / np.sqrt(number[kept])
     return Stack((kept + 0.5) * step - before, middle[kept].astype(np.float64), error)
-
-
-def _dither(time: np.ndarray, length: int, std: float) -> np.ndarray:
-    """Values (m, length) spread evenly over one step of the counts, whose rounding has this standard deviation.
-
-    The median of whole counts is one of them, and so off by up to half a step: it gave pulses a tail of .5 %. From the
-    times, so that the order of the echoes changes nothing.
-    """
-    fraction = time[:, None] * SCATTER[0] + np.arange(length) * SCATTER[1]
-    fraction -= np.floor(fraction)
-    return ((fraction - 0.5) * (std * np.sqrt(12.0))).astype(np.float32)
 
 
 class PulseFit(NamedTuple):
@@ -145,7 +139,22 @@ def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal:
             worth = last
         if len(fits) == most or last - worth == 2:
             return fits[: worth + 1]
-        parameters = _add_component(stack, weight, parameters, residual)
+        # The best of several starts with one more Gaussian, on its way to where it will settle.
+        # At the largest and the smallest residual, and at the peak: a shape that is sharper or flatter than a Gaussian
+        # leaves small residuals of both signs around it, and a strip of RIEGL learned it or not by the half that was
+        # looked at. The fit is weighted by errors; what is compared is the plain misfit, as everywhere else: by
+        # weights, the exact tail wins over a core that strong echoes miss three times as much.
+        around = parameters[2]
+        smooth = np.convolve(residual, np.ones(5) / 5, mode="same")
+        starts = [
+            np.r_[parameters, smooth[at], stack.lag[at], factor * around]
+            for at in sorted({int(np.argmax(smooth)), int(np.argmin(smooth))})
+            for factor in (0.7, 1.5, 4.0)
+        ]
+        sharper = np.r_[parameters, -0.2, parameters[1], 1.3 * around]
+        sharper[0] += 0.2
+        tried = [_refine(stack, weight, start, TRIAL_EVALUATIONS) for start in (*starts, sharper)]
+        parameters = min(tried, key=lambda p: float(np.sum((_sum(p, stack.lag) - stack.value) ** 2)))
 
 
 def refine_gaussians(stack: Stack, components: np.ndarray) -> PulseFit:
@@ -270,27 +279,6 @@ def fit_bounded(
         else:
             damping *= 4
     return at
-
-
-def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """The best of several starts with one more Gaussian, on its way to where it will settle.
-
-    At the largest and the smallest residual, and at the peak: a shape that is sharper or flatter than a Gaussian leaves
-    small residuals of both signs around it, and a strip of RIEGL learned it or not by the half that was looked at. The
-    fit is weighted by errors; what is compared is the plain misfit, as everywhere else: by weights, the exact tail wins
-    over a core that strong echoes miss three times as much.
-    """
-    width = parameters[2]
-    smooth = np.convolve(residual, np.ones(5) / 5, mode="same")
-    starts = [
-        np.r_[parameters, smooth[at], stack.lag[at], factor * width]
-        for at in sorted({int(np.argmax(smooth)), int(np.argmin(smooth))})
-        for factor in (0.7, 1.5, 4.0)
-    ]
-    sharper = np.r_[parameters, -0.2, parameters[1], 1.3 * width]
-    sharper[0] += 0.2
-    tried = [_refine(stack, weight, start, TRIAL_EVALUATIONS) for start in (*starts, sharper)]
-    return min(tried, key=lambda p: float(np.sum((_sum(p, stack.lag) - stack.value) ** 2)))
 
 
 def _as_fit(parameters: np.ndarray, rms: float) -> PulseFit:

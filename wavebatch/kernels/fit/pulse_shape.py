@@ -87,19 +87,52 @@ def evaluate_pulse(shape: PulseShape, x: np.ndarray, t: np.ndarray, s: np.ndarra
     z = x - t
     z *= 1 / s
     if shape.components:
-        return _evaluate_components(shape, x, t, s, z)
+        # A sum of Gaussians that a target widens together; amplitude of the first one (docs/algorithms.md R1).
+        pulse, by_time, by_width = _evaluate_gaussian(z)
+        variance = s * s
+        for weight, delay, extra in shape.components:
+            wide = variance + np.float32(extra)
+            inverse = 1 / np.sqrt(wide)
+            ratio = s * inverse
+            d = (x - (t + np.float32(delay))) * inverse
+            part, part_time, part_width = _evaluate_gaussian(d)
+            part *= np.float32(weight) * ratio
+            pulse += part
+            by_time += part_time * (np.float32(weight) * ratio * ratio)
+            # d/ds of ratio * exp(-d^2/2): s * (1/s - s/wide) * part + (s/wide) * s * weight * ratio * part_width
+            by_width += part * (1 - ratio * ratio)
+            by_width += part_width * (np.float32(weight) * ratio * ratio * ratio)
+        return pulse, by_time, by_width
     if shape.table is not None:
-        return _evaluate_table(shape.table, z)
+        place = (z - z.dtype.type(shape.table.first)) * z.dtype.type(1 / shape.table.step)
+        np.clip(place, 0, len(shape.table.value) - 1.001, out=place)
+        row = place.astype(np.int32)
+        place -= row
+        columns = (shape.table.value, shape.table.slope)
+        pulse, slope = (column[row] + place * (column[row + 1] - column[row]) for column in columns)
+        return pulse, -slope, -slope * z
     if shape.power != 2.0:
-        return _evaluate_power(shape.power, z)
+        # f = exp(-|z|^p / 2).
+        kind = z.dtype.type
+        distance = np.maximum(np.abs(z), kind(1e-6))
+        by_width = exp(kind(shape.power) * log(distance))
+        pulse = exp(kind(-0.5) * by_width)
+        by_width *= kind(0.5 * shape.power) * pulse
+        return pulse, np.copysign(by_width / distance, z), by_width
     if abs(shape.kappa) >= NO_SKEW:
-        return _evaluate_skewed(shape.kappa, z)
+        # f = exp(-L^2/2), L = log1p(kappa z)/kappa, 0 where kappa z <= -1 (docs/algorithms.md 0).
+        inside = np.float32(shape.kappa) * z
+        gone = inside <= np.float32(-0.999999)
+        inside[gone] = 0
+        level = log1p(inside)
+        level *= np.float32(1 / shape.kappa)
+        pulse = exp(np.float32(-0.5) * level * level)
+        pulse[gone] = 0
+        inside += np.float32(1)
+        by_time = pulse * level
+        by_time /= inside
+        return pulse, by_time, by_time * z
     return _evaluate_gaussian(z)
-
-
-def evaluate_unit(z: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The unit Gaussian e = exp(-z^2/2), e z and e z^2, each of the shape of z."""
-    return _evaluate_gaussian(z.copy())
 
 
 def _evaluate_gaussian(z: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -109,62 +142,6 @@ def _evaluate_gaussian(z: np.ndarray) -> tuple[np.ndarray, ...]:
     by_time = pulse * z
     z *= by_time
     return pulse, by_time, z
-
-
-def _evaluate_skewed(kappa: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
-    """f = exp(-L^2/2), L = log1p(kappa z)/kappa, 0 where kappa z <= -1 (docs/algorithms.md 0)."""
-    inside = np.float32(kappa) * z
-    gone = inside <= np.float32(-0.999999)
-    inside[gone] = 0
-    level = log1p(inside)
-    level *= np.float32(1 / kappa)
-    pulse = exp(np.float32(-0.5) * level * level)
-    pulse[gone] = 0
-    inside += np.float32(1)
-    by_time = pulse * level
-    by_time /= inside
-    return pulse, by_time, by_time * z
-
-
-def _evaluate_power(power: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
-    """f = exp(-|z|^p / 2)."""
-    kind = z.dtype.type
-    distance = np.maximum(np.abs(z), kind(1e-6))
-    by_width = exp(kind(power) * log(distance))
-    pulse = exp(kind(-0.5) * by_width)
-    by_width *= kind(0.5 * power) * pulse
-    return pulse, np.copysign(by_width / distance, z), by_width
-
-
-def _evaluate_table(table: PulseTable, z: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The table by linear interpolation."""
-    place = (z - z.dtype.type(table.first)) * z.dtype.type(1 / table.step)
-    np.clip(place, 0, len(table.value) - 1.001, out=place)
-    row = place.astype(np.int32)
-    place -= row
-    pulse, slope = (column[row] + place * (column[row + 1] - column[row]) for column in (table.value, table.slope))
-    return pulse, -slope, -slope * z
-
-
-def _evaluate_components(
-    shape: PulseShape, x: np.ndarray, t: np.ndarray, s: np.ndarray, z: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """Sum of Gaussians that a target widens together; amplitude of the first one (docs/algorithms.md R1)."""
-    pulse, by_time, by_width = _evaluate_gaussian(z)
-    variance = s * s
-    for weight, delay, extra in shape.components:
-        wide = variance + np.float32(extra)
-        inverse = 1 / np.sqrt(wide)
-        ratio = s * inverse
-        d = (x - (t + np.float32(delay))) * inverse
-        part, part_time, part_width = _evaluate_gaussian(d)
-        part *= np.float32(weight) * ratio
-        pulse += part
-        by_time += part_time * (np.float32(weight) * ratio * ratio)
-        # d/ds of ratio * exp(-d^2/2): s * (1/s - s/wide) * part + (s/wide) * s * weight * ratio * part_width
-        by_width += part * (1 - ratio * ratio)
-        by_width += part_width * (np.float32(weight) * ratio * ratio * ratio)
-    return pulse, by_time, by_width
 
 
 LEAST_RISE = 1e-3
@@ -268,26 +245,12 @@ def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
     peak, half_width = np.empty((2, len(widths)))
     n, k = ctypes.c_int64(len(widths)), ctypes.c_int64(len(terms))
     library.call("measure_lobes", n, widths, k, terms, peak, half_width)
-    return PulseMeasures(widths, peak, _make_rising(half_width))
-
-
-def _make_rising(half_width: np.ndarray) -> np.ndarray:
-    """Half widths that grow with every width, because they are inverted to find widths.
-
-    Some flat-topped sums have dips, which are deeper where the sum is narrow: the pulse is lower there, its half width
-    larger.
-    """
-    if np.all(np.diff(half_width) > 0):
-        return half_width
-    level = np.minimum.accumulate(half_width[::-1])[::-1]
-    return level * (1 + LEAST_RISE * np.linspace(0, 1, len(level)))
-
-
-def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float]:
-    """Height and place of the peak, and full width at half maximum of its lobe."""
-    top = int(np.argmax(pulse))
-    begin, end = lobe_edges(x, pulse, 0.5 * pulse[top])
-    return float(pulse[top]), float(x[top]), end - begin
+    # Half widths are inverted to find widths, so they must grow. Some flat-topped sums have dips, which are deeper
+    # where the sum is narrow: the pulse is lower there, its half width larger.
+    if not np.all(np.diff(half_width) > 0):
+        level = np.minimum.accumulate(half_width[::-1])[::-1]
+        half_width = level * (1 + LEAST_RISE * np.linspace(0, 1, len(level)))
+    return PulseMeasures(widths, peak, half_width)
 
 
 MOST_STEPS, LARGEST_STEP, SETTLED = 100, 0.25, 1e-9
@@ -356,7 +319,10 @@ def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
     x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])
     spline = scipy.interpolate.CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))
     fine = np.arange(x[0], x[-1], step / 64)
-    height, peak, full = _measure_one(spline(fine), fine)
+    pulse = spline(fine)
+    top = int(np.argmax(pulse))
+    begin, end = lobe_edges(fine, pulse, 0.5 * pulse[top])
+    height, peak, full = float(pulse[top]), float(fine[top]), end - begin
     unit = full / FWHM_PER_SIGMA
     rows = np.arange(np.ceil((x[0] - peak) / unit * TABLE_ROWS), np.floor((x[-1] - peak) / unit * TABLE_ROWS) + 1)
     z = rows / TABLE_ROWS
@@ -369,20 +335,6 @@ def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
 
 HERMITE_REACH = 5.0
 """Half-widths over which the Gauss-Hermite moments run: beyond, the pulse is zero."""
-
-
-def _hermite(
-    z: np.ndarray, pulse: np.ndarray, by_time: np.ndarray, by_width: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The two directions (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e, from a pulse e, e z and e z^2."""
-    p3 = by_width * z
-    p4 = p3 * z
-    p3 *= np.float32(8)
-    p3 -= np.float32(12) * by_time
-    p4 *= np.float32(16)
-    p4 -= np.float32(48) * by_width
-    p4 += np.float32(12) * pulse
-    return p3, p4
 
 
 def residual_moments(
@@ -423,17 +375,20 @@ def residual_moments(
             # Centres are subtracted in double precision; float32 is then enough for the small rest.
             z = np.arange(-size, size + 1, dtype=np.float32) - (time[part] - middle).astype(np.float32)[:, None]
             z *= (1 / width[part]).astype(np.float32)[:, None]
-            pulse, by_time, by_width = evaluate_unit(z)
+            pulse, by_time, by_width = _evaluate_gaussian(z.copy())
             if cut:
                 values = np.where(inside, values, np.float32(0))
                 pulse, by_time, by_width = (column * inside for column in (pulse, by_time, by_width))
-            p3, p4 = _hermite(z, pulse, by_time, by_width)
-            h3[part] = _project(p3[:, None], values)[:, 0] / std[part]
-            h4[part] = _project(p4[:, None], values)[:, 0] / std[part]
+            # Two directions (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e.
+            p3 = by_width * z
+            p4 = p3 * z
+            p3 *= np.float32(8)
+            p3 -= np.float32(12) * by_time
+            p4 *= np.float32(16)
+            p4 -= np.float32(48) * by_width
+            p4 += np.float32(12) * pulse
+            for moment, direction in ((h3, p3[:, None]), (h4, p4[:, None])):
+                # The component of the residual along a direction, made unit length.
+                norm = np.sqrt(np.maximum(np.einsum("mkl,mkl->mk", direction, direction), 1e-12))
+                moment[part] = (np.einsum("mkl,ml->mk", direction, values) / norm)[:, 0] / std[part]
     return h3, h4
-
-
-def _project(direction: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Component of the residual (m, L) along each direction (m, k, L), made unit length."""
-    norm = np.einsum("mkl,mkl->mk", direction, direction)
-    return np.einsum("mkl,ml->mk", direction, residual) / np.sqrt(np.maximum(norm, 1e-12))

@@ -389,17 +389,14 @@ def misfit_of_angles(halves: Halves, planes: Planes, ray: np.ndarray) -> np.ndar
         DOUBTFUL, nothing above.
     """
     facing, short, long = (np.einsum("ni,ni->n", ray, planes.axes[:, :, axis]) for axis in range(3))
-    angle = _angle_of(facing)
+    angle = np.arccos(np.minimum(np.abs(facing), 1.0))
     off = np.zeros(len(ray))
     for b, c in (halves.tilts[:, side].T for side in range(2)):
-        off = np.maximum(off, np.abs(_angle_of((facing - b * long - c * short) / np.sqrt(1.0 + b * b + c * c)) - angle))
+        cosine = (facing - b * long - c * short) / np.sqrt(1.0 + b * b + c * c)
+        off = np.maximum(off, np.abs(np.arccos(np.minimum(np.abs(cosine), 1.0)) - angle))
     with np.errstate(divide="ignore"):
         share = (np.log(DOUBTFUL) - np.log(halves.chance)) / np.log(DOUBTFUL / SURE)
     return off * np.sqrt(np.clip(share, 0.0, 1.0))
-
-
-def _angle_of(cosine: np.ndarray) -> np.ndarray:
-    return np.arccos(np.minimum(np.abs(cosine), 1.0))
 
 
 def _fit(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

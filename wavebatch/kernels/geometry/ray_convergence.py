@@ -219,10 +219,14 @@ def fit_sensor(
         distance = float(np.median(np.sqrt(np.einsum("ni,ni->n", ahead, ahead))))
     found[0] += origin
     covariance = np.full(normal.shape, np.nan)
-    if _condition(normal) < 1e14:
+    conditions = []
+    for part in (normal, normal[:3, :3]):
+        values = np.linalg.eigvalsh(part) if np.isfinite(part).all() else np.zeros(1)
+        conditions.append(float(values[-1] / values[0]) if values[0] > 0 else np.inf)
+    if conditions[0] < 1e14:
         covariance = residual**2 * _redundancy(time, unit, left) * np.linalg.inv(normal)
-    condition = _condition(normal[:3, :3])
-    return SensorFit(centre, half, found, covariance, condition, distance, measure_extent(unit), residual, len(used))
+    extent = measure_extent(unit)
+    return SensorFit(centre, half, found, covariance, conditions[1], distance, extent, residual, len(used))
 
 
 def fit_best(
@@ -288,28 +292,18 @@ def measure_turn(
     angle, axes = _find_across(unit)
     bends = np.vander(angle / max(float(np.abs(angle).max()), 1e-9), BENDS, increasing=True)[:, 1:]
     mirror = ((across @ axes)[:, :, None, :] * bends[:, None, :, None]).reshape(3 * len(q), -1)
-    parts = [_see_turn(off, some, root, (time, unit), fit.distance) for some in (moves, np.hstack([moves, mirror]))]
+    parts = []
+    for some in (moves, np.hstack([moves, mirror])):
+        # What a turn does to the rays, and what they miss, without what these motions explain.
+        rest = off - some @ np.linalg.lstsq(some, off, rcond=STILL)[0]
+        normal, right = rest[:, :3].T @ rest[:, :3], rest[:, :3].T @ rest[:, 3]
+        left = (rest[:, 3] - rest[:, :3] @ (np.linalg.pinv(normal, hermitian=True) @ right)).reshape(-1, 3)
+        kept = int((root > 0).sum())
+        variance = float((left * left).sum()) / max(2 * kept - some.shape[1] - 3, 1) * _redundancy(time, unit, left)
+        variance = max(variance, 1e-30)
+        parts.append((normal / variance, right / variance, normal / kept * (fit.distance / SCANNER) ** 2))
     information, right, floor = (np.stack(values) for values in zip(*parts, strict=True))
     return TurnSeen(information, right, floor, explained[:3, :3])
-
-
-def _see_turn(
-    off: np.ndarray, moves: np.ndarray, root: np.ndarray, rays: tuple[np.ndarray, np.ndarray], distance: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Information of a turn, its right side and its floor, as `TurnSeen`, of what `moves` do not explain of `off`: what
-    a turn does to the rays, and what they miss."""
-    off = off - moves @ np.linalg.lstsq(moves, off, rcond=STILL)[0]
-    normal, right = off[:, :3].T @ off[:, :3], off[:, :3].T @ off[:, 3]
-    left = (off[:, 3] - off[:, :3] @ (np.linalg.pinv(normal, hermitian=True) @ right)).reshape(-1, 3)
-    kept = int((root > 0).sum())
-    variance = float((left * left).sum()) / max(2 * kept - moves.shape[1] - 3, 1) * _redundancy(*rays, left)
-    variance = max(variance, 1e-30)
-    return normal / variance, right / variance, normal / kept * (distance / SCANNER) ** 2
-
-
-def _condition(normal: np.ndarray) -> float:
-    values = np.linalg.eigvalsh(normal) if np.isfinite(normal).all() else np.zeros(1)
-    return float(values[-1] / values[0]) if values[0] > 0 else np.inf
 
 
 def measure_extent(unit: np.ndarray) -> float:

@@ -189,8 +189,9 @@ def energy_error(
     -------
     float64 (m,)
     """
-    a = np.asarray(amplitude_err, np.float64) / _positive(amplitude)
-    s = np.asarray(sigma_err, np.float64) / _positive(sigma)
+    values = (np.asarray(value, np.float64) for value in (amplitude, sigma))
+    a, s = (np.asarray(error, np.float64) / np.where(value > 0, value, np.nan)
+            for error, value in zip((amplitude_err, sigma_err), values, strict=True))  # fmt: skip
     return np.sqrt(a * a + s * s + 2.0 * ENERGY_CORRELATION * a * s)
 
 
@@ -279,11 +280,6 @@ def known_distance(distance: np.ndarray) -> np.ndarray:
     """The distance in float64; NaN where it is not a positive number."""
     distance = np.asarray(distance, np.float64)
     return np.where(np.isfinite(distance) & (distance > 0), distance, np.nan)
-
-
-def _positive(values: np.ndarray) -> np.ndarray:
-    values = np.asarray(values, np.float64)
-    return np.where(values > 0, values, np.nan)
 
 
 def receive_power(

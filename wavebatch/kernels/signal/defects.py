@@ -60,24 +60,17 @@ def find_spikes(above: np.ndarray, std: float, width: float) -> np.ndarray:
     high = np.maximum(left, right)
     spikes[1:-1] = middle - high > np.float32(SPIKE * std) + drop * np.maximum(middle, 0)
     spikes[1:-1] &= middle > np.float32(HEIGHT * std)
-    low = _least_between(above, np.float32(width))
-    spikes[2:-2] |= low - above[2:-2] > np.float32(HOLE * std) + drop * np.maximum(high, 0)[1:-1]
-    return spikes
-
-
-def _least_between(above: np.ndarray, width: np.float32) -> np.ndarray:
-    """Least value (s - 4, n) that a sum of pulses can have at a sample, as its two neighbours on either side say.
-
-    The logarithm of a sum of Gaussians of a width w or more bends down by at most 1 / w^2 at any place. So a sample is
-    at least the square of its neighbour over the next one, reduced by that bend. In a valley between two strong echoes
-    this bound is nearly 0. It is never above the neighbour.
-    """
-    bend = exp(np.float32(-CURVATURE) / (width * width))
+    # The logarithm of a sum of Gaussians of a width w or more bends down by at most 1 / w^2 at any place. So a sample
+    # is at least the square of its neighbour over the next one, reduced by that bend. In a valley between two strong
+    # echoes this bound is nearly 0. It is never above the neighbour.
+    bend = exp(np.float32(-CURVATURE) / (np.float32(width) * np.float32(width)))
     sides = []
     for near, far in ((above[1:-3], above[:-4]), (above[3:-1], above[4:])):
         falls = np.maximum(near, np.float32(0)) / np.maximum(np.maximum(near, far), np.float32(1e-6))
         sides.append(near * np.where(near > 0, bend * falls, np.float32(1)))
-    return np.minimum(*sides)
+    low = np.minimum(*sides)
+    spikes[2:-2] |= low - above[2:-2] > np.float32(HOLE * std) + drop * np.maximum(high, 0)[1:-1]
+    return spikes
 
 
 def fill_spikes(signal: np.ndarray, spikes: np.ndarray) -> None:
@@ -205,7 +198,14 @@ def fit_slopes(
     """
     s = len(signal)
     x = (np.arange(s, dtype=np.float32) - np.float32(0.5 * (s - 1)))[:, None]
-    level, slope = _first_lines(signal)
+    # Level at the middle and slope of each waveform: the median slope between lower quartiles of its parts.
+    edges = np.linspace(0, s, SEGMENTS + 1).astype(int)
+    parts = [signal[begin:end] for begin, end in zip(edges, edges[1:], strict=False)]
+    low = np.stack([np.partition(part, len(part) // 4, axis=0)[len(part) // 4] for part in parts])
+    place = (0.5 * (edges[1:] + edges[:-1] - 1) - 0.5 * (s - 1)).astype(np.float32)
+    first, second = np.triu_indices(SEGMENTS, 1)
+    slope = np.median((low[second] - low[first]) / (place[second] - place[first])[:, None], axis=0)
+    level = np.median(low - slope * place[:, None], axis=0)
     number = total = np.zeros(signal.shape[1])
     for extra in (2.0, 1.0, 0.0):
         rest = signal - (level + slope * x)
@@ -222,15 +222,3 @@ def fit_slopes(
     enough = (number >= s // 5) & (total > number * (0.15 * s) ** 2)
     error = np.where(enough, std / np.sqrt(np.maximum(total, 1e-9)), np.inf)
     return slope.astype(np.float64), error.astype(np.float64)
-
-
-def _first_lines(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level at the middle and slope of each waveform: the median slope between lower quartiles of its parts."""
-    s = len(signal)
-    edges = np.linspace(0, s, SEGMENTS + 1).astype(int)
-    parts = [signal[begin:end] for begin, end in zip(edges, edges[1:], strict=False)]
-    low = np.stack([np.partition(part, len(part) // 4, axis=0)[len(part) // 4] for part in parts])
-    place = (0.5 * (edges[1:] + edges[:-1] - 1) - 0.5 * (s - 1)).astype(np.float32)
-    first, second = np.triu_indices(SEGMENTS, 1)
-    slope = np.median((low[second] - low[first]) / (place[second] - place[first])[:, None], axis=0)
-    return np.median(low - slope * place[:, None], axis=0), slope

@@ -186,13 +186,41 @@ def _estimate_from(
         if missing is not None:
             quiet &= ~missing
         if turn and reach > SEEN:
-            quiet = _leave_faint_out(_average(above, covariance, number, reach), quiet, reach)
+            # Means of `reach` samples above their level, which see most of a pulse, over the noise of mean and level.
+            s = len(above)
+            size = np.arange(1, max(s, reach) + 1)
+            chance = np.maximum(_mean_variance(covariance, len(size)), QUANTISATION_STD**2 / size)
+            total = accumulate(np.add, np.nan_to_num(above).astype(np.float64))
+            end = np.minimum(np.arange(s) + reach - reach // 2, s)
+            begin = end - np.minimum(reach, end)
+            summed = total[end - 1] - np.where((begin > 0)[:, None], total[begin - 1], 0.0)
+            spread = chance[end - begin - 1][:, None] + chance[np.maximum(number, 1) - 1]
+            means = (summed / (end - begin)[:, None] / np.sqrt(spread)).astype(np.float32)
+            means = np.where(np.isnan(above), above, means)
+            # Only echoes make more of them so high than so low: noise is as often below its level, however slow it is.
+            bound = np.float32(np.sqrt(2 * log(max(s / reach, 1.0) / BY_CHANCE)))  # Chernoff's
+            high, low = (int(np.count_nonzero((quiet & (side > bound)).any(axis=0))) for side in (means, -means))
+            if high - low > CHANCE * np.sqrt(high + low):
+                calm = quiet & find_ends(means, float(bound), reach // 2, 0)
+                quiet = calm if np.count_nonzero(calm[1:] & calm[:-1]) >= LEAST_PAIRS else quiet
         above = signal - np.nan_to_num(level)
         mean, number = quiet_mean(above, quiet)
-        used, lags = quiet & _find_calm(above - mean, quiet), int(np.clip(2 * reach, *LAGS))
+        # Waveforms whose quiet samples scatter like those of most others: the foot of an echo may be below a limit.
+        deviation = above - mean
+        power = np.einsum("sn,sn->n", deviation * quiet, deviation) / np.maximum(number, 1)
+        enough = number >= EDGE
+        typical = float(median(power[enough])) if enough.any() else 0.0
+        used = quiet & (~enough | (power <= ALIKE * max(typical, QUANTISATION_STD**2)))
+        lags = int(np.clip(2 * reach, *LAGS))
         measured = measure_covariance(signal, used, lags)
-        if measured is not None and not _may_be_lopsided(signal, used, measured):
-            own = _common_level(np.nan_to_num(level) + mean, number, measured)
+        # Noise that is rounded off or cut off is not as often above its level as below it; too few samples hide it.
+        many = np.count_nonzero(used)
+        cut = many < ENOUGH or np.count_nonzero(used & (signal == signal.min())) > MOST_LEAST * many
+        if measured is not None and not cut and measured[0] >= ROUNDED**2:
+            # The level of most, or where these scatter by more than the noise its own.
+            centre = np.nan_to_num(level) + mean
+            _, spread = _spread_of_levels(centre[number > 0].astype(np.float64), number[number > 0], measured)
+            own = centre if spread**2 > measured[0] else np.full_like(centre, median(centre[number > 0]))
             measured = _leave_signal_out(signal, own, used, measured, lags, last if turn else _smoothed_std(measured))
         if measured is None:
             known = level[np.isfinite(level)].astype(np.float64)
@@ -233,34 +261,6 @@ def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float
     values = values - median(values)
     above, below = (float(np.sum(np.square(values[side]), dtype=np.float64)) for side in (values > 0, values < 0))
     return above / max(below, 1e-12)
-
-
-def _average(above: np.ndarray, covariance: np.ndarray, number: np.ndarray, reach: int) -> np.ndarray:
-    """Means of `reach` samples above their level (s, n), which see most of a pulse, over the noise of mean and level.
-
-    number: samples (n,) that the level of each waveform is the mean of.
-    """
-    s = len(above)
-    size = np.arange(1, max(s, reach) + 1)
-    chance = np.maximum(_mean_variance(covariance, len(size)), QUANTISATION_STD**2 / size)
-    total = accumulate(np.add, np.nan_to_num(above).astype(np.float64))
-    end = np.minimum(np.arange(s) + reach - reach // 2, s)
-    begin = end - np.minimum(reach, end)
-    summed = total[end - 1] - np.where((begin > 0)[:, None], total[begin - 1], 0.0)
-    own, level = chance[end - begin - 1], chance[np.maximum(number, 1) - 1]
-    mean = summed / (end - begin)[:, None] / np.sqrt(own[:, None] + level)
-    return np.where(np.isnan(above), above, mean.astype(np.float32))
-
-
-def _leave_faint_out(mean: np.ndarray, quiet: np.ndarray, reach: int) -> np.ndarray:
-    """Quiet samples (s, n) without those beside means of `reach` samples that only echoes make so high.
-
-    mean: over its noise (s, n). Noise is as often as far below its level, however slow it is.
-    """
-    limit = np.float32(np.sqrt(2 * log(max(len(mean) / reach, 1.0) / BY_CHANCE)))  # Chernoff's bound
-    high, low = (int(np.count_nonzero((quiet & (side > limit)).any(axis=0))) for side in (mean, -mean))
-    calm = quiet & find_ends(mean, float(limit), reach // 2, 0) if high - low > CHANCE * np.sqrt(high + low) else quiet
-    return calm if np.count_nonzero(calm[1:] & calm[:-1]) >= LEAST_PAIRS else quiet
 
 
 def quiet_edges(signal: np.ndarray, missing: np.ndarray | None = None) -> tuple[np.ndarray, float]:
@@ -335,31 +335,6 @@ def find_ends(above: np.ndarray, width: float, reach: int, recovery: int = 0) ->
     return quiet
 
 
-def _find_calm(deviation: np.ndarray, quiet: np.ndarray) -> np.ndarray:
-    """Waveforms (n,) whose quiet samples scatter like those of most others: the foot of an echo may be below a limit.
-
-    deviation: of quiet samples from their mean (s, n).
-    """
-    number = quiet.sum(axis=0)
-    power = np.einsum("sn,sn->n", deviation * quiet, deviation) / np.maximum(number, 1)
-    enough = number >= EDGE
-    typical = float(median(power[enough])) if enough.any() else 0.0
-    return ~enough | (power <= ALIKE * max(typical, QUANTISATION_STD**2))
-
-
-def _common_level(own: np.ndarray, number: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Level of each waveform (n,) [count]: that of most, or where these scatter by more than the noise its own."""
-    _, spread = _spread_of_levels(own[number > 0].astype(np.float64), number[number > 0], covariance)
-    return own if spread**2 > covariance[0] else np.full_like(own, median(own[number > 0]))
-
-
-def _may_be_lopsided(signal: np.ndarray, quiet: np.ndarray, covariance: np.ndarray) -> bool:
-    """Whether noise is not as often above its level as below it, rounded off or cut off; or too few samples show it."""
-    number = np.count_nonzero(quiet)
-    cut = number < ENOUGH or np.count_nonzero(quiet & (signal == signal.min())) > MOST_LEAST * number
-    return bool(cut or covariance[0] < ROUNDED**2)
-
-
 def _leave_signal_out(
     signal: np.ndarray, level: np.ndarray, quiet: np.ndarray, plain: np.ndarray, lags: int, std: float
 ) -> np.ndarray:
@@ -386,19 +361,18 @@ def _leave_signal_out(
     mirrored = measure_covariance(signal, quiet, lags, beyond)
     if mirrored is None:
         return plain
-    least, most = _pulse_variance(mirrored, lags), _pulse_variance(plain, lags)
+    # Variances of noise to a pulse a sixth as wide as the lags, over that of white noise, or that of a sample.
+    variances = []
+    for covariance in (mirrored, plain):
+        k = np.arange(1, len(covariance))
+        weight = exp(-0.25 * (k * 6 / lags) ** 2)  # not by BLAS, whose last bits depend on the processor
+        variances.append(float(covariance[0] + max(2 * np.einsum("k,k->", covariance[1:], weight), 0.0)))
+    least, most = variances
     if most <= SKEWED * least:
         return plain
     share, size = (SKEWED - 1) * least / (most - least), max(len(plain), len(mirrored))
     longer = [np.pad(one, (0, size - len(one))) for one in (plain, mirrored)]
     return share * longer[0] + (1 - share) * longer[1]
-
-
-def _pulse_variance(covariance: np.ndarray, lags: int) -> float:
-    """Variance of noise to a pulse a sixth as wide as the lags, over that of white noise, or that of a sample."""
-    k = np.arange(1, len(covariance))
-    weight = exp(-0.25 * (k * 6 / lags) ** 2)  # not by BLAS, whose last bits depend on the processor
-    return float(covariance[0] + max(2 * np.einsum("k,k->", covariance[1:], weight), 0.0))
 
 
 def measure_covariance(
@@ -435,7 +409,8 @@ def measure_covariance(
     # In fewer waveforms than `measure_recovery` needs a tail of echoes looks like slow noise.
     most = MOST_LAGS if signal.shape[1] >= 2 * LEAST_WAVEFORMS else lags
     for lag in range(1, min(most, len(signal) - 1) + 1):
-        if lag > lags and not _rises(half):
+        # Slow noise: a variogram is higher at each of its last lags than at those before.
+        if lag > lags and not (min(half[-RISE:]) > max(half[-2 * RISE : -RISE])):
             break
         number, square = _pair_differences(signal, quiet, masks, lag)
         if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
@@ -489,11 +464,6 @@ def _extend(
         return None
     sill = min(float(size[best]) + QUANTISATION_STD**2, float(np.var(signal[quiet], dtype=np.float64)))
     return np.r_[sill, sill - half, max(sill - half[-1], 0.0) * power[best, : lags - len(half)]]
-
-
-def _rises(half: list[float]) -> bool:
-    """Whether a variogram is higher at each of its last lags than at those before, as in slow noise."""
-    return min(half[-RISE:]) > max(half[-2 * RISE : -RISE])
 
 
 def _smoothed_std(covariance: np.ndarray) -> float:

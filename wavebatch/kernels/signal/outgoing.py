@@ -135,7 +135,14 @@ def measure_outgoing(samples: np.ndarray, reference: OutgoingReference) -> Outgo
     n, s = values.shape
     rows, place = np.arange(n), np.arange(s, dtype=np.float32)
     peak = np.clip(np.argmax(values, axis=1), 1, max(s - 2, 1)) if s > 2 else np.zeros(n, int)
-    level, variance = _find_levels(values, peak, reference)
+    # Quiet samples of each shot, drawn to the level of all shots.
+    quiet = np.arange(values.shape[1]) < (peak - QUIET * reference.width)[:, None]
+    number = quiet.sum(axis=1)
+    mean = np.where(quiet, values, 0).sum(axis=1, dtype=np.float64) / np.maximum(number, 1)
+    within = reference.noise**2 * reference.gain / np.maximum(number, 1)
+    share = np.where(number > 0, reference.spread**2 / (reference.spread**2 + within), 0.0)
+    level = reference.level + share * (mean - reference.level)
+    variance = np.where(number > 0, share * within, reference.spread**2)
     values -= level.astype(np.float32)[:, None]
     three = np.stack([values[rows, np.clip(peak + step, 0, s - 1)] for step in (-1, 0, 1)]).astype(np.float64)
     low, top, high = log(np.maximum(three, 0.5 * reference.noise))
@@ -155,13 +162,3 @@ def measure_outgoing(samples: np.ndarray, reference: OutgoingReference) -> Outgo
     seen = (amplitude > LEAST_HEIGHT * reference.noise) & (energy > 0)
     measures = (energy, amplitude, time, level, energy_error, amplitude_error)
     return OutgoingPulses(*(np.where(seen, measure, np.nan) for measure in measures))
-
-
-def _find_levels(values: np.ndarray, peak: np.ndarray, reference: OutgoingReference) -> tuple[np.ndarray, np.ndarray]:
-    """Level of each shot and its variance: its quiet samples, drawn to the level of all shots."""
-    quiet = np.arange(values.shape[1]) < (peak - QUIET * reference.width)[:, None]
-    number = quiet.sum(axis=1)
-    mean = np.where(quiet, values, 0).sum(axis=1, dtype=np.float64) / np.maximum(number, 1)
-    within = reference.noise**2 * reference.gain / np.maximum(number, 1)
-    share = np.where(number > 0, reference.spread**2 / (reference.spread**2 + within), 0.0)
-    return reference.level + share * (mean - reference.level), np.where(number > 0, share * within, reference.spread**2)

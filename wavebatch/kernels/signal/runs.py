@@ -111,11 +111,9 @@ def lobe_edges(x: np.ndarray, curve: np.ndarray, level: float) -> tuple[float, f
     top = int(np.argmax(curve))
     right = top + int(np.argmax(curve[top:] < level))
     left = top - int(np.argmax(curve[top::-1] < level))
-
-    def cross(a: int, b: int) -> float:
-        return x[a] + (x[b] - x[a]) * (level - curve[a]) / (curve[b] - curve[a])
-
-    return cross(left + 1, left), cross(right - 1, right)
+    crossed = ((left + 1, left), (right - 1, right))
+    begin, end = (x[a] + (x[b] - x[a]) * (level - curve[a]) / (curve[b] - curve[a]) for a, b in crossed)
+    return begin, end
 
 
 def walk_down(

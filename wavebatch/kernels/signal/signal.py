@@ -6,8 +6,6 @@ is what makes NumPy fast here.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from wavebatch.core.order import distinct
@@ -114,81 +112,44 @@ def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:
     long = end - start >= LEAST_PADDING
     row, start, end = row[long], start[long], end[long]
     marks = _mark_runs(row, start, end, n, s)
-    edges = _look_at_edges(samples, marks, np.r_[row, row], np.r_[start - 1, end], np.repeat([-1, 1], len(row)))
-    good = _step_from_zero(edges, n) if value == 0 else _step_from_top(edges, value)
+    # The recorded samples next to both ends of each run, where it does not end with the waveform.
+    beside, first = np.r_[row, row], np.r_[start - 1, end]
+    at = first[:, None] + np.repeat([-1, 1], len(row))[:, None] * np.arange(LEAST_RECORDED)
+    place = beside[:, None], np.clip(at, 0, s - 1)
+    known, outside = ((at >= 0) & (at < s) & ~marks[place]).all(axis=1), (first < 0) | (first >= s)
+    near = samples[place].astype(np.float64)
+    ordered = np.sort(near, axis=1)
+    near, level, middle = near[:, 0], ordered[:, 2], ordered[:, LEAST_RECORDED // 2]
+    if value:
+        # From the largest count the waveform falls to its level within one sample.
+        steps = known & (value - near >= STEP_FROM_TOP * (value - level)) & (near <= 0.5 * value)
+    else:
+        # From zeros it rises to its level, or to an echo, within one sample. At half of the edges of a waveform at
+        # least there is no echo; the level there counts at the others. The flank of a clipped echo that goes down lies
+        # far below a level that hardly varies.
+        least = np.maximum(STEP_FROM_ZERO * level, level - 4 * (middle - level) - 1)
+        sure = known & ~outside & (near >= least)
+        common = np.full(n, np.inf)
+        np.minimum.at(common, beside[sure], level[sure])
+        enough = 2 * np.bincount(beside[sure], minlength=n) >= np.bincount(beside[~outside], minlength=n)
+        steps = (sure | (known & (near >= STEP_FROM_ZERO * common[beside]))) & enough[beside]
+    good = outside | steps
     good = (good[: len(row)] & good[len(row) :]) & ((start > 0) | (end < s))
     if value == 0:
         low = ((samples < LEAST_LEVEL) & ~marks).any(axis=1)
         doubtful = low.copy()
         doubtful[row[~good]] = True
-        good &= ~doubtful[row]
-        good |= low[row] & _stand_out(samples, row, start, end)
+        # Zeros are none of a level near zero where the level before them is low and steady, so that no echo falls, and
+        # zeros are rare elsewhere in the waveform.
+        inner = (start >= LEAST_RECORDED) & ((end <= s - LEAST_RECORDED) | (end == s))
+        before = samples[row[:, None], np.maximum(start[:, None] - 1 - np.arange(LEAST_RECORDED), 0)].astype(np.int64)
+        ordered = np.sort(before, axis=1)
+        middle = ordered[:, LEAST_RECORDED // 2]
+        steady = (middle >= 1) & (middle < 2 * LEAST_LEVEL) & (ordered[:, -3] - middle <= LEAST_LEVEL)
+        others = (samples == 0).sum(axis=1)[row] - (end - start)
+        stands_out = inner & steady & (others <= RARE_ZEROS * (s - (end - start)))
+        good = (good & ~doubtful[row]) | (low[row] & stands_out)
     return _mark_runs(row[good], start[good], end[good], n, s)
-
-
-def _stand_out(samples: np.ndarray, row: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Whether zeros from start to end (k,) are none of a level near zero, bool (k,).
-
-    Before them the level is low and steady, so that no echo falls, and zeros are rare elsewhere in the waveform.
-    """
-    s = samples.shape[1]
-    inner = (start >= LEAST_RECORDED) & ((end <= s - LEAST_RECORDED) | (end == s))
-    before = samples[row[:, None], np.maximum(start[:, None] - 1 - np.arange(LEAST_RECORDED), 0)].astype(np.int64)
-    ordered = np.sort(before, axis=1)
-    middle = ordered[:, LEAST_RECORDED // 2]
-    steady = (middle >= 1) & (middle < 2 * LEAST_LEVEL) & (ordered[:, -3] - middle <= LEAST_LEVEL)
-    others = (samples == 0).sum(axis=1)[row] - (end - start)
-    return inner & steady & (others <= RARE_ZEROS * (s - (end - start)))
-
-
-class _Edges(NamedTuple):
-    """The recorded samples next to both ends of k / 2 runs, each array (k,)."""
-
-    row: np.ndarray
-    outside: np.ndarray
-    """Where the waveform ends with the run."""
-    known: np.ndarray
-    """Where LEAST_RECORDED samples are recorded next to the run."""
-    first: np.ndarray
-    """The first of them [count]."""
-    level: np.ndarray
-    """The third least of them [count]."""
-    middle: np.ndarray
-    """Their median [count]."""
-
-
-def _look_at_edges(
-    samples: np.ndarray, marks: np.ndarray, row: np.ndarray, first: np.ndarray, side: np.ndarray
-) -> _Edges:
-    """Edges of runs; `marks` (n, s) holds all runs. first: sample next to the run, side: away from it, 1 or -1."""
-    s = samples.shape[1]
-    at = first[:, None] + side[:, None] * np.arange(LEAST_RECORDED)
-    place = row[:, None], np.clip(at, 0, s - 1)
-    known = ((at >= 0) & (at < s) & ~marks[place]).all(axis=1)
-    near = samples[place].astype(np.float64)
-    ordered = np.sort(near, axis=1)
-    return _Edges(row, (first < 0) | (first >= s), known, near[:, 0], ordered[:, 2], ordered[:, LEAST_RECORDED // 2])
-
-
-def _step_from_top(edges: _Edges, value: int) -> np.ndarray:
-    """Whether the waveform falls from the largest count to its level within one sample, bool (k,)."""
-    step = (value - edges.first >= STEP_FROM_TOP * (value - edges.level)) & (edges.first <= 0.5 * value)
-    return edges.outside | (edges.known & step)
-
-
-def _step_from_zero(edges: _Edges, n: int) -> np.ndarray:
-    """Whether the waveform rises from zeros to its level, or to an echo, within one sample, bool (k,).
-
-    At half of the edges of a waveform at least there is no echo; the level there counts at the others.
-    """
-    # The flank of a clipped echo that goes down lies far below a level that hardly varies.
-    least = np.maximum(STEP_FROM_ZERO * edges.level, edges.level - 4 * (edges.middle - edges.level) - 1)
-    sure = edges.known & ~edges.outside & (edges.first >= least)
-    level = np.full(n, np.inf)
-    np.minimum.at(level, edges.row[sure], edges.level[sure])
-    enough = 2 * np.bincount(edges.row[sure], minlength=n) >= np.bincount(edges.row[~edges.outside], minlength=n)
-    rises = sure | (edges.known & (edges.first >= STEP_FROM_ZERO * level[edges.row]))
-    return edges.outside | (rises & enough[edges.row])
 
 
 def _mark_runs(row: np.ndarray, start: np.ndarray, end: np.ndarray, n: int, s: int) -> np.ndarray:
@@ -261,12 +222,7 @@ def find_peaks(signal: np.ndarray, threshold: np.ndarray | float) -> tuple[np.nd
     sample, waveform = np.divmod(flat, n)
     order = np.argsort(waveform.astype(np.uint16) if n <= 65536 else waveform, kind="stable")
     waveform, sample = waveform[order], sample[order]
-    top = _is_top(signal, waveform, sample)
-    return waveform[top], sample[top]
-
-
-def _is_top(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """False (m,) where the plateau that begins at a sample is a step of a rising flank."""
+    # A plateau is no peak where it is a step of a rising flank.
     top = np.ones(len(sample), bool)
     flat = np.arange(len(sample))
     ahead = sample.copy()
@@ -276,7 +232,7 @@ def _is_top(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray) -> np.
         rise = signal[ahead[flat], waveform[flat]] - signal[sample[flat], waveform[flat]]
         top[flat] = rise <= 0
         flat = flat[rise == 0]
-    return top
+    return waveform[top], sample[top]
 
 
 def widen(mask: np.ndarray, reach: int) -> np.ndarray:

@@ -89,7 +89,8 @@ def samples_of(block: WaveformBlock, noise: Noise) -> Samples:
     Samples
         Raw counts with their levels.
     """
-    return Samples(block.samples, noise.for_fits, noise.std, block.missing)
+    levels = noise.baseline if noise.of_sample is None else noise.of_sample
+    return Samples(block.samples, levels, noise.std, block.missing)
 
 
 def make_table(

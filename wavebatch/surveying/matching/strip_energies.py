@@ -135,7 +135,16 @@ def take_energies(
                 f"their light beside that of the others, {100 * more:.1f} % of error hold it; --energy "
                 f"{energy.source} gives them no values"
             )
-    apart = _find_alternation(pulses)
+    # By how much the logarithm of the light of neighbouring pulses of one channel differs in turns; 0 where not.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        light = np.log(pulses[1] / pulses[2])
+    apart = 0.0
+    for channel in np.unique(pulses[3]):
+        # Packets without signal, and pulses of unknown energy, have no light to compare.
+        own = light[(pulses[3] == channel) & np.isfinite(light)]
+        if len(own) > LEAST_COMPARED:
+            near, *far = (float(np.nanmedian(np.abs(own[k:] - own[:-k]))) for k in (1, *PERIODS))
+            apart = max(apart, near) if near > LEAST_APART and min(far) < LIKE * near else apart
     if apart:
         notes.append(
             f"the light of neighbouring pulses alternates by a factor of {math.exp(-apart):.2f}, as of two lasers or "
@@ -198,20 +207,6 @@ def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy
         parts.append(np.stack([block.gps_time, np.nansum(take_off_level(block), axis=1), sent, channel]))
     joined = np.concatenate(parts, axis=1)
     return joined[:, np.argsort(joined[0], kind="stable")]
-
-
-def _find_alternation(pulses: np.ndarray) -> float:
-    """By how much the logarithm of the light of neighbouring pulses of one channel differs in turns; 0 where not."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        light = np.log(pulses[1] / pulses[2])
-    most = 0.0
-    for channel in np.unique(pulses[3]):
-        # Packets without signal, and pulses of unknown energy, have no light to compare.
-        own = light[(pulses[3] == channel) & np.isfinite(light)]
-        if len(own) > LEAST_COMPARED:
-            near, *far = (float(np.nanmedian(np.abs(own[k:] - own[:-k]))) for k in (1, *PERIODS))
-            most = max(most, near) if near > LEAST_APART and min(far) < LIKE * near else most
-    return most
 
 
 def _read_places(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> list[np.ndarray]:

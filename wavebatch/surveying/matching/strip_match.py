@@ -343,7 +343,22 @@ def match_strip(
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows: list[ChannelConstant] = []
     missing: dict[int, str] = {}
-    pulses = _find_pulses(calibration, reader, scan, system, sensor)
+    # Widths at half maximum of the pulses of all digitizers that have one of their own, and of the others as 0 [ns].
+    # A hillside widens every echo, so that the survey of its strip finds a wider pulse than the sensor has: where a
+    # pulse is wider than the calibration's, what the slopes of the strip's surfaces add to it is taken off.
+    systems = {0: system, **system.digitizers}
+    known = [row.pulse_ns for row in calibration.channels if row.pulse_ns]
+    divergence = system.radiometry.divergence or calibration.divergence
+    widest = max(one.sigma_ref for one in systems.values()) * FWHM_PER_SIGMA
+    if known and divergence and widest > NEAR_WIDTH * min(known):
+        main = max(scan.by_descriptor, key=lambda index: (index not in system.digitizers, scan.by_descriptor[index]))
+        spacing = reader.facts.digitizers[main].spacing
+        face = sample_reference(reader, scan, sensor, system.with_radiometry(divergence=divergence), spacing).system
+        systems = {0: face, **face.digitizers}
+    pulses = {
+        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.widths.variance, 0.0))
+        for index, one in systems.items()
+    }
     for index in sorted(scan.by_descriptor):
         pulse = pulses.get(index, pulses[0])
         found, missing[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
@@ -382,29 +397,6 @@ def match_strip(
         calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=(), notes=tuple(notes)
     )
     return fitted.widened(air), tuple(dict.fromkeys(warnings))
-
-
-def _find_pulses(
-    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
-) -> dict[int, float]:
-    """Widths at half maximum of the pulses of all digitizers that have one of their own, and of the others as 0 [ns].
-
-    A hillside widens every echo, so that the survey of its strip finds a wider pulse than the sensor has: where a pulse
-    is wider than the calibration's, what the slopes of the strip's surfaces add to it is taken off.
-    """
-    systems = {0: system, **system.digitizers}
-    known = [row.pulse_ns for row in calibration.channels if row.pulse_ns]
-    divergence = system.radiometry.divergence or calibration.divergence
-    widest = max(one.sigma_ref for one in systems.values()) * FWHM_PER_SIGMA
-    if known and divergence and widest > NEAR_WIDTH * min(known):
-        main = max(scan.by_descriptor, key=lambda index: (index not in system.digitizers, scan.by_descriptor[index]))
-        spacing = reader.facts.digitizers[main].spacing
-        seen = sample_reference(reader, scan, sensor, system.with_radiometry(divergence=divergence), spacing).system
-        systems = {0: seen, **seen.digitizers}
-    return {
-        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.widths.variance, 0.0))
-        for index, one in systems.items()
-    }
 
 
 def _match_digitizer(

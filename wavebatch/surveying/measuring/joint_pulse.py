@@ -94,7 +94,9 @@ def learn_jointly(
     missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
-    misfit = misfit_of(_miss(best, stack)[core], STEP * system.sigma_ref / spacing, width)
+    # As the kernel counts it: root of the energy that is left over that of a Gaussian of this width.
+    left = _miss(best, stack)[core]
+    misfit = float(np.sqrt(np.sum(left * left) * (STEP * system.sigma_ref / spacing) / (SQRT_PI * width)))
     system = replace(system, kappa=0.0, components=(), ringing=0.0, misfit=misfit)
     if len(best.components) == 1:
         return replace(system, sigma_ref=float(best.components[0, 2]) * spacing)
@@ -113,21 +115,20 @@ def count_telling(explained: Explained) -> int:
     return int(number[number <= MOST_ECHOES].sum())
 
 
-def misfit_of(left: np.ndarray, step: float, width: float) -> float:
-    """Return the misfit of a pulse that leaves these shares of its height at lags `step` apart [samples].
-
-    As the kernel counts it: root of the energy that is left over that of a Gaussian of this width [samples].
-    """
-    return float(np.sqrt(np.sum(left * left) * step / (SQRT_PI * width)))
-
-
 def stack_jointly(system: SystemPulse, explained: Explained, change: float, spacing: float) -> Stack:
     """Return the pulse with its errors by lag [samples]."""
     s = explained.sums.left.shape[1]
     width = system.sigma_ref / spacing
     reference = shape_limits(system, spacing).ref
     reference *= find_own_width(explained, reference)
-    delay, sigma = _place_gaussians(width, s)
+    core = np.arange(-BEFORE, CORE, FINE)
+    far, wide = [CORE], [1.0]
+    while far[-1] < min(AFTER, 0.7 * s / width):
+        wide.append(GROWTH * far[-1])
+        far.append(far[-1] + wide[-1])
+    narrow = max(NARROW * width, NARROW)
+    sigma = np.r_[np.full(len(core), narrow), np.maximum(np.array(wide) * width, narrow)]
+    delay = np.r_[core, far] * width
     noise = sample_noise(system)
     # Samples that were cut off leave nothing, whatever the pulse is there: they teach nothing.
     sums = explained.sums._replace(used=explained.sums.used & (explained.sums.left != 0))
@@ -138,7 +139,15 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     share = (system.noise.std / max(system.noise.quiet, 1e-6)) ** 2
     matrix, right = matrix / share, right / share
     # Height 1 means the amplitude of the present main component; areas of narrower Gaussians are drawn higher.
-    matrix[:-1, :-1] += _expect(delay / width, sigma)
+    # What is known of the weights before any waveform, as a matrix of normal equations; lag in widths.
+    lag = delay / width
+    away = np.where(
+        np.abs(lag) < 2.5, 1.0, np.maximum(exp(-(np.abs(lag) - 2.5) / 3.0), np.where(lag > 0, LATE, EARLY))
+    )
+    # Weights are areas: those of a pulse of height 1 are about its sigma times the distance of two Gaussians.
+    spread = SMOOTH * away * sigma / sigma[0]
+    bend = np.diff(np.eye(len(lag)), 2, axis=0) / (0.5 * spread[1:-1])[:, None]
+    matrix[:-1, :-1] += np.einsum("ki,kj->ij", bend, bend) + np.diag((np.abs(lag) > 2.5) / (3 * spread) ** 2)
     matrix += 1e-9 * np.trace(matrix) / len(delay) * np.eye(len(matrix))
     inverse = solve(matrix, np.eye(len(matrix)))
     weight = np.einsum("ij,j->i", inverse, right)
@@ -149,29 +158,6 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     error = np.sqrt(np.maximum(np.einsum("lk,kj,lj->l", rows, inverse[:-1, :-1], rows), 0.0))
     top = max(float(value.max()), 1e-30)
     return Stack(lag, value / top, np.maximum(error / top, LEAST_ERROR))
-
-
-def _place_gaussians(width: float, s: int) -> tuple[np.ndarray, np.ndarray]:
-    """Delays and sigmas of the Gaussians [samples] of a pulse of this width in waveforms of s samples."""
-    core = np.arange(-BEFORE, CORE, FINE)
-    far, wide = [CORE], [1.0]
-    while far[-1] < min(AFTER, 0.7 * s / width):
-        wide.append(GROWTH * far[-1])
-        far.append(far[-1] + wide[-1])
-    narrow = max(NARROW * width, NARROW)
-    sigma = np.r_[np.full(len(core), narrow), np.maximum(np.array(wide) * width, narrow)]
-    return np.r_[core, far] * width, sigma
-
-
-def _expect(lag: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """What is known of the weights before any waveform, as a matrix of normal equations; lag in widths."""
-    away = np.where(
-        np.abs(lag) < 2.5, 1.0, np.maximum(exp(-(np.abs(lag) - 2.5) / 3.0), np.where(lag > 0, LATE, EARLY))
-    )
-    # Weights are areas: those of a pulse of height 1 are about its sigma times the distance of two Gaussians.
-    spread = SMOOTH * away * sigma / sigma[0]
-    bend = np.diff(np.eye(len(lag)), 2, axis=0) / (0.5 * spread[1:-1])[:, None]
-    return np.einsum("ki,kj->ij", bend, bend) + np.diag((np.abs(lag) > 2.5) / (3 * spread) ** 2)
 
 
 def _miss(fit: PulseFit, stack: Stack) -> np.ndarray:

@@ -59,22 +59,14 @@ def find_isolated(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -
 
     The half of them nearest to the lower edge of the widths: flat targets, whose echoes slopes do not widen.
     """
-    return _nearest_to_edge(clear.take(np.flatnonzero(clear.amplitude <= _highest(block, system, clear.amplitude))))
-
-
-def _highest(block: WaveformBlock, system: SystemPulse, amplitude: np.ndarray) -> float:
-    """Amplitude up to which clear echoes teach the pulse: at least half of them, where all are nearly as high."""
     top = system.saturation or float(block.samples.max())
-    return max(FAR_FROM_LIMIT * top, float(np.median(amplitude)) if len(amplitude) else 0.0)
-
-
-def _nearest_to_edge(echoes: EchoTable) -> EchoTable:
-    """At most half of the echoes, those whose widths are nearest to the lower edge of all, and at most NARROWEST off.
-
-    In a forest hardly an echo has the pulse's width: there it is fewer, but at least ENOUGH_TO_LEARN.
-    """
+    # At least half of them, where all are nearly as high.
+    highest = max(FAR_FROM_LIMIT * top, float(np.median(clear.amplitude)) if len(clear) else 0.0)
+    echoes = clear.take(np.flatnonzero(clear.amplitude <= highest))
     if len(echoes) < FEW:
         return echoes
+    # At most half of the echoes, those whose widths are nearest to the lower edge of all, and at most NARROWEST off.
+    # In a forest hardly an echo has the pulse's width: there it is fewer, but at least ENOUGH_TO_LEARN.
     distance = np.abs(log(echoes.sigma / find_edge(echoes.sigma)))
     order = np.argsort(distance, kind="stable")
     near = int(np.count_nonzero(distance < NARROWEST))
@@ -130,7 +122,14 @@ def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figu
     skewed = fit_skewed(stack, width)
     figures.misfit_goal, figures.misfit_skewed, figures.kappa = goal, skewed.rms, skewed.kappa
     figures.misfit_gaussians = {len(fit.components): fit.rms for fit in sums}
-    best = sums[-1] if small else _simplest(stack, [sums[0], skewed, *sums[1:]], goal)
+    best = sums[-1]
+    if not small:
+        # The first fit whose misfit is below the goal, or that the errors of the stack allow, or that is near the best.
+        # By its errors: what a few lags of the tail show for sure is nothing in the mean of all.
+        fits, error = [sums[0], skewed, *sums[1:]], np.maximum(stack.error, 0.25 * np.median(stack.error))
+        chi = [float(np.sqrt(np.mean((_draw_scaled(fit, stack) / error - stack.value / error) ** 2))) for fit in fits]
+        enough = max(GOAL, NEAR_BEST * min(chi))
+        best = next(fit for fit, one in zip(fits, chi, strict=True) if one <= enough or fit.rms <= goal)
     if len(best.components) > 1:
         # All components that were worth fitting: fewer would save nothing, and tiles would disagree on their number.
         best = sums[-1]
@@ -169,17 +168,6 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
             return pulses[0]
         misfits.append(float(np.quantile(residual, 0.1)))
     return pulses[1] if misfits[1] < BETTER * misfits[0] else pulses[0]
-
-
-def _simplest(stack: Stack, fits: list[PulseFit], goal: float) -> PulseFit:
-    """The first fit whose misfit is below the goal, or that the errors of the stack allow, or that is near the best.
-
-    By its errors: what a few lags of the tail show for sure is nothing in the mean of all.
-    """
-    error = np.maximum(stack.error, 0.25 * np.median(stack.error))
-    chi = [float(np.sqrt(np.mean((_draw_scaled(fit, stack) / error - stack.value / error) ** 2))) for fit in fits]
-    enough = max(GOAL, NEAR_BEST * min(chi))
-    return next(fit for fit, one in zip(fits, chi, strict=True) if one <= enough or fit.rms <= goal)
 
 
 CORE = 4.0

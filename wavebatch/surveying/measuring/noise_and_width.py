@@ -314,7 +314,11 @@ def fit_lone(block: WaveformBlock, noise: Noise, system: SystemPulse, least: flo
     candidates = maximum(block, noise, system)
     strongest, second = find_strongest(candidates, n)
     amplitude = candidates.amplitude[strongest]
-    share = _alone_share(amplitude, second, floor)
+    # How high the second strongest echo of a waveform may be, as a share of the strongest.
+    clear = amplitude > floor
+    alone = clear & (second < ALONE * amplitude)
+    enough = max(LEAST_ALONE * clear.sum(), min(ENOUGH_ALONE, clear.sum()))
+    share = ALONE if alone.sum() >= enough else ALONE_BEFORE_RINGING
     hopeful = np.zeros(n, bool)
     hopeful[candidates.waveform[strongest]] = (LOOSE * amplitude > floor) & (second < LOOSE * share * amplitude)
     candidates = candidates.take(np.flatnonzero(hopeful[candidates.waveform]))
@@ -325,14 +329,6 @@ def fit_lone(block: WaveformBlock, noise: Noise, system: SystemPulse, least: flo
     good = (echoes.amplitude > floor) & (second < share * echoes.amplitude)
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
     return echoes.take(np.flatnonzero(good))
-
-
-def _alone_share(amplitude: np.ndarray, second: np.ndarray, floor: float) -> float:
-    """How high, as a share of the strongest echo (m,) of a waveform, the second strongest (m,) may be."""
-    clear = amplitude > floor
-    alone = clear & (second < ALONE * amplitude)
-    enough = max(LEAST_ALONE * clear.sum(), min(ENOUGH_ALONE, clear.sum()))
-    return ALONE if alone.sum() >= enough else ALONE_BEFORE_RINGING
 
 
 def find_single(echoes: EchoTable, n: int, system: SystemPulse, above: float = MIN_SNR) -> np.ndarray:

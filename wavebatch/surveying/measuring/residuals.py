@@ -243,21 +243,6 @@ def _robust_std(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean((kept.astype(np.float64) - np.mean(kept, dtype=np.float64)) ** 2)))
 
 
-def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Share h of a sample's variance that the fit of amplitude, time and width takes away, and what it brings there of
-    a variance that is the pulse itself, of height 1: the sum of h_ij^2 S_j over the samples j.
-
-    lag: after the echo's centre, in widths. width: of the echo [samples]. The three derivatives of a Gaussian span the
-    first three Hermite functions: their products add up to h_ij, times the width.
-    """
-    z = lag.astype(np.float64) ** 2
-    # Squares of the three, and the product of the first and the last one, over exp(-z^2) / sqrt(pi).
-    squares = np.ones_like(z), 2 * z, 0.5 * (2 * z - 1) ** 2
-    bell = exp(-z) / np.sqrt(np.pi) / width
-    brought = sum(part * share for part, share in zip(squares, BROUGHT, strict=True)) + (2 * z - 1) * BROUGHT_CROSS
-    return np.minimum(bell * sum(squares), 0.9), bell * brought
-
-
 def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: float) -> tuple[np.ndarray, ...]:
     """What all echoes of about one height leave at one lag: the pulse's misfit, which a receiver may change with the
     height. Second targets are at another lag in every waveform.
@@ -291,18 +276,6 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
     return middle[place], number[place], spread[place]
 
 
-def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core: np.ndarray) -> np.ndarray:
-    """Residuals at `core` (mask) less what all echoes of about one height leave at one lag (k,).
-
-    That part changes with the height where a receiver compresses, and would look like noise that grows with the signal:
-    one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
-    """
-    height = np.broadcast_to(model.max(axis=1)[:, None], lag.shape)[core]
-    values = residual[core].astype(np.float64)
-    common, number, _ = find_common(values, lag[core], height, GROWTH_REACH)
-    return (values - common) * np.sqrt(number / np.maximum(number - 1, 1))
-
-
 def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...]) -> tuple[np.ndarray, float]:
     """Least squares by some columns of the terms, with no negative factor: the factors of all, and the sum of squares.
 
@@ -330,9 +303,24 @@ def _noise_gain(
 ) -> float:
     """Growth of the variance per count of signal, 0 where it could be chance (H12)."""
     core = np.abs(lag) < GROWTH_REACH
-    taken, brought = _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
-    squared = _chance_part(residual, model, lag, core) ** 2 / (1 - taken)
+    # Share h of a sample's variance that the fit of amplitude, time and width takes away, and what it brings there of a
+    # variance that is the pulse itself, of height 1: the sum of h_ij^2 S_j over the samples j.
+    # lag: after the echo's centre, in widths. width: of the echo [samples]. The three derivatives of a Gaussian span
+    # the first three Hermite functions: their products add up to h_ij, times the width.
+    z = lag[core].astype(np.float64) ** 2
+    # Squares of the three, and the product of the first and the last one, over exp(-z^2) / sqrt(pi).
+    squares = np.ones_like(z), 2 * z, 0.5 * (2 * z - 1) ** 2
+    bell = exp(-z) / np.sqrt(np.pi) / np.broadcast_to(width[:, None], lag.shape)[core]
+    brought = sum(part * share for part, share in zip(squares, BROUGHT, strict=True)) + (2 * z - 1) * BROUGHT_CROSS
+    taken = np.minimum(bell * sum(squares), 0.9)
+    brought = bell * brought
+    # Residuals at `core` (mask) less what all echoes of about one height leave at one lag (k,).
+    # That part changes with the height where a receiver compresses, and would look like noise that grows with the
+    # signal: one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
     height = np.broadcast_to(model.max(axis=1)[:, None], lag.shape)[core]
+    values = residual[core].astype(np.float64)
+    common, number, _ = find_common(values, lag[core], height, GROWTH_REACH)
+    squared = ((values - common) * np.sqrt(number / np.maximum(number - 1, 1))) ** 2 / (1 - taken)
     # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
     signal = (model[core].astype(np.float64) * (1 - 2 * taken) + height * brought) / (1 - taken)
     if len(signal) < 2000:

@@ -50,7 +50,11 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     """
     plain = replace(system, noise=replace(system.noise, whitening=()))
     whitening = predict_noise(system.noise.correlation)
-    if whitening is None or system.noise.quiet < LEAST_NOISE or _predicted(whitening) < LEAST_PREDICTED:
+    if whitening is None or system.noise.quiet < LEAST_NOISE:
+        return plain
+    near, far = whitening
+    predicted = 1 - (1 - (near / (1 - far)) ** 2) * (1 - far * far)  # of the variance of the next sample
+    if predicted < LEAST_PREDICTED:
         return plain
     block = thin_samples(block, LOOK)
     whitened = replace(system, noise=replace(system.noise, whitening=whitening))
@@ -68,9 +72,3 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     length = describe_waveforms(block, whitened, explain(block, whitened), [change])[0]
     other = describe_waveforms(block, plain, explained, [change])[0]
     return whitened if exceed(length, other) <= SURE else plain
-
-
-def _predicted(whitening: tuple[float, float]) -> float:
-    """Share of the noise's variance that two samples predict of the next one."""
-    near, far = whitening
-    return 1 - (1 - (near / (1 - far)) ** 2) * (1 - far * far)

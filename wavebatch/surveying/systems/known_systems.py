@@ -237,8 +237,9 @@ def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
     best = min(found, key=lambda one: one.difference, default=None)
     if best is None or best.difference >= ALIKE:
         return None
-    gaussian = SystemPulse(sigma_ref=gaussian_width(best.known.system))
-    limit = min(ALIKE, NOT_A_GAUSSIAN * compare_pulses(best.known.system, gaussian))
+    widths = best.known.system.sigma_ref * np.linspace(0.7, 1.5, 41)
+    nearest = min(compare_pulses(best.known.system, SystemPulse(sigma_ref=float(width))) for width in widths)
+    limit = min(ALIKE, NOT_A_GAUSSIAN * nearest)
     return best if best.difference < limit else None
 
 
@@ -266,12 +267,6 @@ def draw_pulse(system: SystemPulse, lag: np.ndarray) -> np.ndarray:
     """Return the height of a system's pulse at times after the centre of its main component [ns], f8 of that shape."""
     width = shape_limits(system, 1.0).ref
     return evaluate_pulse(pulse_shape(system, 1.0), lag[:, None], np.zeros(1), np.full(1, width))[0][:, 0]
-
-
-def gaussian_width(system: SystemPulse) -> float:
-    """Return the width [ns] of the Gaussian that is nearest to a system's pulse."""
-    widths = system.sigma_ref * np.linspace(0.7, 1.5, 41)
-    return float(min(widths, key=lambda width: compare_pulses(system, SystemPulse(sigma_ref=float(width)))))
 
 
 WEAKER, REACH = 0.5, 15

@@ -14,7 +14,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.look import STEADY, compare_looks, list_kinds, look_at, read_flight
+from wavebatch.surveying.look import STEADY, compare_looks, kind_of, look_at, read_flight
 from wavebatch.surveying.systems.figures import Look
 from wavebatch.surveying.systems.survey_result import Survey
 
@@ -52,7 +52,8 @@ def with_look(survey: Survey, blocks: Iterable[WaveformBlock]) -> Survey:
     look = look_at(blocks, survey.system)
     if look is None:
         return survey
-    return replace(survey, figures=replace(survey.figures, look=look, kinds=list_kinds(blocks)))
+    kinds = {block.digitizer.index: kind_of(block) for block in blocks}
+    return replace(survey, figures=replace(survey.figures, look=look, kinds=kinds))
 
 
 def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, force: bool = False) -> str:
@@ -123,7 +124,10 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     else:
         known = {(figures.bits, figures.spacing_ns)} if figures.bits and figures.spacing_ns else forms
     if not forms & known:
-        return f"its samples have {_in_words(forms)}, those of the survey {_in_words(known)}", True
+        mine, others = (
+            " or ".join(f"{bits:g} bits, {step:g} ns apart" for bits, step in sorted(some)) for some in (forms, known)
+        )
+        return f"its samples have {mine}, those of the survey {others}", True
     look = look_at(blocks, survey.system)
     if look is None:
         return "", False
@@ -134,10 +138,6 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     surely = compare_looks(look, whole, survey.system, wider=LARGEST_WIDTH - 1)
     reason = surely or compare_looks(look, whole, survey.system)
     return reason.replace("the flight", "the survey"), bool(surely)
-
-
-def _in_words(forms: set[Form]) -> str:
-    return " or ".join(f"{bits:g} bits, {step:g} ns apart" for bits, step in sorted(forms))
 
 
 def _compare_system(look: Look, survey: Survey) -> str:

@@ -94,7 +94,7 @@ def _describe(survey: Survey) -> Iterator[tuple[str, str]]:
     system, figures = survey.system, survey.figures
     yield "surveyed", f"{survey.waveforms} waveforms"
     yield "noise", f"{system.noise.std:.3f} DN, baseline {system.noise.baseline:.3f} DN"
-    yield "system pulse", f"{name_model(system)}; full width at half maximum {full_width(system):.3f} ns"
+    yield "system pulse", f"{name_model(system)}; full width at half maximum {system.sigma_ref * FWHM_PER_SIGMA:.3f} ns"
     if figures.echoes_per_waveform is not None:
         yield "echoes", f"{figures.echoes_per_waveform:.3f} per waveform, 99 % below {figures.amplitude_99:.1f} DN"
     needed = ", ".join(decision.part for decision in survey.decisions if decision.needed)
@@ -106,11 +106,6 @@ def name_model(system: SystemPulse) -> str:
     if system.components:
         return f"learned, {len(system.components)} Gaussians"
     return f"skewed, kappa {system.kappa:.4f}" if system.kappa else "Gaussian"
-
-
-def full_width(system: SystemPulse) -> float:
-    """Full width of the echo of a flat target at half of its maximum [ns]."""
-    return system.sigma_ref * FWHM_PER_SIGMA
 
 
 def sample_pulse(system: SystemPulse, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -225,13 +225,13 @@ def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
 def list_methods() -> dict[str, Chain]:
     """A chain per detector, without a fit, and per decomposer, after a detector that serves it; by stage."""
     names = {kind: sorted(name for name in STAGES if STAGES[name].kind == kind) for kind in ("detect", "decompose")}
-    chains = {name: _build_chain(name, name, "decompose.none") for name in names["detect"]}
+    pairs = {name: (name, "decompose.none") for name in names["detect"]}
     others = (name for name in names["decompose"] if name != "decompose.none")
-    return chains | {name: _build_chain(name, DETECTORS.get(name, "detect.maximum"), name) for name in others}
-
-
-def _build_chain(name: str, detector: str, decomposer: str) -> Chain:
-    return Chain(tuple(Step(STAGES[stage]) for stage in ("noise.pooled", detector, decomposer, *ATTRIBUTES)), name)
+    pairs |= {name: (DETECTORS.get(name, "detect.maximum"), name) for name in others}
+    return {
+        name: Chain(tuple(Step(STAGES[stage]) for stage in ("noise.pooled", *pair, *ATTRIBUTES)), name)
+        for name, pair in pairs.items()
+    }
 
 
 # A scene like a strip

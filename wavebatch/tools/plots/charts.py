@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wavebatch.core.order import EvenSample
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
 from wavebatch.files.figure_file import has_matplotlib, open_svg, plain_text
@@ -21,7 +22,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.systems.survey_result import full_width, sample_pulse
+from wavebatch.surveying.systems.survey_result import sample_pulse
 from wavebatch.tools.cells import Raster, Tally, choose_grid, compute_cells, find_shown, robust_limits
 from wavebatch.tools.compare_chains import find_residual
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
@@ -98,7 +99,8 @@ def chart_pulse(system: SystemPulse, spacing: float, title: str = "System pulse"
         axes.set(xlim=(time[0], time[-1]), ylim=(min(0.0, float(pulse.min())) - 0.05, 1.35))
         axes.legend(loc="upper right", fontsize=7.5, borderaxespad=0.2)
 
-    words = f"Full width at half maximum {full_width(system):.3f} ns; dots are {spacing:g} ns apart, as samples are."
+    full = system.sigma_ref * FWHM_PER_SIGMA
+    words = f"Full width at half maximum {full:.3f} ns; dots are {spacing:g} ns apart, as samples are."
     return chart(title, ("time after the peak [ns]", "height"), draw, words)
 
 

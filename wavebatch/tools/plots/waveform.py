@@ -17,7 +17,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,8 +102,10 @@ def find_places(
     path = reader.facts.path
     if not scan.packets:
         raise InputError(f"{path}: holds no waveform to draw; `wavebatch check` shows what it holds")
+    more = "" if wanted.sheet else f", {MOST_ON_SHEET} with --sheet"
+    too_many = ConfigError(f"{path}: too many waveforms for a picture; {wanted.limit} fit{more}")
     if wanted.number > wanted.limit:
-        raise _too_many(path, wanted)
+        raise too_many
     if wanted.chosen:
         return _find_flagged(reader, scan, wanted, run)
     numbers: list[int] = []
@@ -120,7 +122,7 @@ def find_places(
                 raise ConfigError(f"{path}: there is no packet {span}; packets are 0 to {scan.packets - 1}")
             numbers += range(first, min(end, first + wanted.limit + 1))
     if len(numbers) + len(wanted.points) + len(wanted.times) > wanted.limit:
-        raise _too_many(path, wanted)
+        raise too_many
     for point in wanted.points:
         if not 0 <= point < scan.points:
             raise ConfigError(f"{path}: there is no point {point}; points are 0 to {scan.points - 1}")
@@ -159,11 +161,6 @@ def find_places(
     wants = [("packet", numbers), ("point", wanted.points), ("time", wanted.times)]
     places = [found[kind, one] for kind, each in wants for one in each]
     return list({(place.unit, place.row): place for place in places}.values())
-
-
-def _too_many(path: Any, wanted: Wanted) -> ConfigError:
-    more = "" if wanted.sheet else f", {MOST_ON_SHEET} with --sheet"
-    return ConfigError(f"{path}: too many waveforms for a picture; {wanted.limit} fit{more}")
 
 
 def _read_units(reader: StripReader, scan: StripScan) -> Iterator[tuple[Unit, int]]:

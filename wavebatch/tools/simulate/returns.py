@@ -177,7 +177,7 @@ class LightModel:
                     f"{needed}"
                 )
             self.counts.assumed_unit |= option == "widths" and facts.unit == "-"
-            return reader.find_value(column)
+            return reader.find_column(column)[1]
 
     def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Peak of each return (k,) before the gain (intensity, or received power [W]) and deviation of its echo [ns].

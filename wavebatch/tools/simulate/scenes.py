@@ -114,12 +114,9 @@ def tabulate_echoes(time: np.ndarray, amplitude, sigma, ghost: np.ndarray | None
     n, k = time.shape
     order = np.argsort(time, axis=1, kind="stable")
     keep = ~np.isnan(np.take_along_axis(time, order, 1)).ravel()
-
-    def flatten(values) -> np.ndarray:
-        return np.take_along_axis(np.broadcast_to(values, (n, k)), order, 1).ravel()[keep]
-
-    ghosts = None if ghost is None else flatten(ghost)
-    return Drawn(np.repeat(np.arange(n), k)[keep], flatten(time), flatten(amplitude), flatten(sigma), ghosts)
+    columns = (time, amplitude, sigma, *([] if ghost is None else [ghost]))
+    flat = (np.take_along_axis(np.broadcast_to(values, (n, k)), order, 1).ravel()[keep] for values in columns)
+    return Drawn(np.repeat(np.arange(n), k)[keep], *flat)
 
 
 @frozen
