@@ -233,9 +233,9 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     that it must be, unless another echo is in its place (docs/algorithms.md R3).
     """
     ref = system.sigma_ref
-    least = SURELY * system.noise.std / np.sqrt(filter_energy(gaussian_taps(ref / block.spacing))) / echoes.amplitude
-    strong = np.flatnonzero(least < LESS * PART)
-    strong = strong[np.argsort(least[strong], kind="stable")[:MOST_STRONG]]
+    found = SURELY * system.noise.std / float(np.sqrt(filter_energy(gaussian_taps(ref / block.spacing))))
+    strong = np.argsort(-echoes.amplitude, kind="stable")[:MOST_STRONG]
+    strong = strong[echoes.amplitude[strong] * LESS * PART > found]
     number = np.full(len(echoes), -1)
     number[strong] = np.arange(len(strong))
     pairs = [(number[other], echoes.amplitude[row] / echoes.amplitude[other], lag / ref)
@@ -244,7 +244,7 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         return system
     owner, share, lag = (np.concatenate(column) for column in zip(*pairs, strict=True))
     owner, share, lag = (column[owner >= 0] for column in (owner, share, lag))
-    least, time = least[strong], echoes.time[strong]
+    least, time = found / echoes.amplitude[strong], echoes.time[strong]
     low, high = -time / ref, ((block.samples.shape[1] - 1) * block.spacing - time) / ref
     must = (share < PART) & (least[owner] < share)
     profile = dict(system.tail_misfit)
@@ -257,7 +257,7 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         np.maximum.at(highest, owner[here], share[here])
         np.maximum.at(beside, owner[near], share[near])
         whole = (low < place - 2) & (high > place + 2)
-        found = []
+        likely = []
         for middle in np.unique(np.round(log(share[here[must[here]]]), 1)):
             part = float(exp(middle))
             seen = whole & (least < LESS * part)
@@ -269,9 +269,9 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
             chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
             with_it = np.count_nonzero(alike)
             if with_it >= max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1)):
-                found.append((with_it - without, alike))
-        if found:
-            alike = max(found, key=lambda one: one[0])[1]
+                likely.append((with_it - without, alike))
+        if likely:
+            alike = max(likely, key=lambda one: one[0])[1]
             part = float(np.quantile(highest[alike], 1 - NORMAL_BELOW[1]))  # targets and noise move it
             around = np.unique(np.rint(lag[here[alike[owner[here]]]])[:, None] + (-1, 0, 1))
             for at in around[np.abs(around) >= 3]:
