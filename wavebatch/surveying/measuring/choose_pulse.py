@@ -382,7 +382,7 @@ def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
     """Standard errors by which a candidate must describe shorter to be taken in place of the other."""
     if longer.answered < BLIND * shorter.answered:
         return HINT
-    most = SHOWN * float(np.sqrt(shorter.answered))
+    most = max(SHOWN * float(np.sqrt(shorter.answered)), HINT)
     fewer = float(np.clip((1 - shorter.echoes / max(longer.echoes, 1)) / (1 - FEWER), -1.0, 1.0))
     if longer.known:
         return min(SURE - HINT * min(fewer, 0.0), most)
