@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 from helpers_scenes import CANOPY_NOISE, CANOPY_SIGMA, grow_canopy
+from stranger_strips import make_strip
 from strangers import judge_strip
 
+import wavebatch
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
@@ -136,6 +138,12 @@ def test_what_weaker_echoes_have_more_of_is_no_tail_where_most_have_a_neighbour(
     system = SystemPulse(2.0, noise=ReceiverNoise(baseline=20.0, std=1.0, by_kind={"quiet": 1.0}))
     clear = EchoTable.build(np.arange(n), time, height, np.full(n, 2.0))
     assert (16.0 in dict(measure_tail(block, system, clear).tail_misfit)) == is_tail
+
+
+def test_a_survey_says_which_echoes_it_takes_for_a_part_of_the_pulse(tmp_path):
+    with wavebatch.open_strip(make_strip(2187, tmp_path)) as strip:
+        reasons = {one.part: one.reason for one in wavebatch.survey(strip).decisions}
+    assert "one of up to 3.0 % of it at -6.0 to -3.7 ns" in reasons["part of the pulse"]
 
 
 @pytest.mark.parametrize(("alone", "raised"), [(1.0, False), (3.0, True)])

@@ -224,7 +224,7 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
     """As survey_block, from noise and width by `clean_sample`; once more where noise grows with the signal."""
-    first, figures = system, Figures()
+    first, figures, repeated = system, Figures(), []
     candidates: tuple[Tried, ...] = ()
     if learn:
         clear = find_clear(block, system)
@@ -255,7 +255,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
-        system = find_parts(part, measure_tail(block, system, clear), echoes)
+        tailed = measure_tail(block, system, clear)
+        system = find_parts(part, tailed, echoes)
+        repeated = sorted(set(system.tail_misfit) - set(tailed.tail_misfit))
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)
@@ -290,6 +292,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     system = measure_skew(part, system, echoes) if learn else system
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
+    if repeated:
+        share, lags = max(share for _, share in repeated), f"{repeated[0][0]:+.1f} to {repeated[-1][0]:+.1f} ns"
+        reason = f"every strong echo has one of up to {100 * share:.1f} % of it at {lags}: echoes there must be higher"
+        decisions = (*decisions, Decision("part of the pulse", True, reason))
     return Survey(system, len(block), figures, decisions, candidates)
 
 
