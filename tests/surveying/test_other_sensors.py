@@ -273,6 +273,40 @@ def test_a_pulse_with_more_echoes_must_describe_shorter_by_more(errors, echoes, 
     assert taken or choose_pulse._decide([first, second]).best.name == "first"
 
 
+def test_a_pulse_that_another_one_had_replaced_may_beat_its_successor():
+    """The first needs fewer echoes than the shortest, by too few errors; a blind one beats it, and is beaten itself."""
+    spread = 0.5 * np.resize([1.0, -1.0], 400)
+    rows = ("shortest", 0 * spread, 200, 150), ("blind", 0.05 + spread, 80, 60), ("first", 0.2 + 2 * spread, 180, 140)
+    found = [
+        choose_pulse.Candidate(name, SystemPulse(2.0), 0.0, 50 + more, echoes, answered, False, 1, 0.0)
+        for name, more, echoes, answered in rows
+    ]
+    assert choose_pulse._decide(found).best.name == "shortest"
+    assert choose_pulse._decide([found[0], found[2]]).best.name == "first"
+
+
+@pytest.mark.parametrize(("answered", "doubted"), [(16, True), (100, False)])
+def test_fewer_echoes_that_lose_for_want_of_waveforms_are_a_doubt(answered, doubted):
+    """By 4 errors: many waveforms would have asked for 4.5, which so few cannot show."""
+    spread = 0.5 * np.resize([1.0, -1.0], 400)
+    wide, short = (
+        choose_pulse.Candidate("", SystemPulse(width), 0.0, 50 + more, each * answered, answered, False, 1, 0.0)
+        for width, more, each in ((2.2, 0.1 + spread, 1), (2.0, 0 * spread, 2))
+    )
+    choice = choose_pulse._decide([wide, short])
+    assert choice.best is (short if doubted else wide) and choice.doubt == pytest.approx(0.5 if doubted else 1.0)
+
+
+@pytest.mark.parametrize("name", [choose_pulse.OF_ALL, *choose_pulse.ROUNDS])
+def test_what_was_learned_again_is_learned_from_all_waveforms_too(name):
+    block = record(gaussian, 5, n=60)[0]
+    system = survey_block(block, learn=False).system
+    one = choose_pulse.Candidate(name, system, 0.0, np.ones(60), 60, 60, False, 1, 0.0)
+    first, again = (replace(one, name=name + end) for end in ("", choose_pulse.AGAIN))
+    learned = choose_pulse._learn_from_all(block, first).system
+    assert choose_pulse._learn_from_all(block, again).system == learned != system
+
+
 def test_the_misfit_is_at_least_what_the_pulse_misses_of_the_stack():
     block = record(gaussian, 5, n=400)[0]
     system = survey_block(block, learn=False).system

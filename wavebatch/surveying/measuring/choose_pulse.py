@@ -343,6 +343,9 @@ def _decide(found: list[Candidate]) -> Choice:
         if _beats(one, best):
             best = one
     tied = [one for one in ordered if one.exceeds(best) < SURE]
+    if SHOWN * np.sqrt(best.answered) < SURE + HINT:  # fewer echoes lost by less than many waveforms would ask for
+        rivals = (one for one in ordered if one.echoes < FEWER * best.echoes and one.answered >= BLIND * best.answered)
+        tied += [one for one in rivals if SURE <= one.exceeds(best) < SURE + HINT]
     echoes = [*best.as_likely, *(one.echoes / max(best.echoes, 1) for one in tied)]
     doubt = max(echoes) - min(echoes)
     widths = [one.system.sigma_ref for one in tied]
@@ -382,7 +385,7 @@ def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
     """Standard errors by which a candidate must describe shorter to be taken in place of the other."""
     if longer.answered < BLIND * shorter.answered:
         return HINT
-    most = max(SHOWN * float(np.sqrt(shorter.answered)), HINT)
+    most = max(SHOWN * float(np.sqrt(max(shorter.answered, longer.answered))), HINT)
     fewer = float(np.clip((1 - shorter.echoes / max(longer.echoes, 1)) / (1 - FEWER), -1.0, 1.0))
     if longer.known:
         return min(SURE - HINT * min(fewer, 0.0), most)

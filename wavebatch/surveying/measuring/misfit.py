@@ -78,6 +78,10 @@ SURELY, REPEATED, OFTEN = 6.0, 5, 2.0
 least, and over those that would and do not: where one strong echo in ten has a neighbour of the same lag and share, as
 in dense canopies, five do so once in 100,000 such places."""
 
+PLACES = 3
+"""Tenths of the strip in which it must be seen: an object with another one behind it lies in one, or in two beside
+each other. Twelve hits of a bright sign were 1.5 % of a strip, and its second echoes were lost."""
+
 ROOM = 2.5
 """Widths of the pulse within which a higher echo hides a lower one."""
 
@@ -245,6 +249,7 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     owner, share, lag = (np.concatenate(column) for column in zip(*pairs, strict=True))
     owner, share, lag = (column[owner >= 0] for column in (owner, share, lag))
     least, time = found / echoes.amplitude[strong], echoes.time[strong]
+    tenth = 10 * echoes.waveform[strong].astype(np.int64) // len(block)
     low, high = -time / ref, ((block.samples.shape[1] - 1) * block.spacing - time) / ref
     must = (share < PART) & (least[owner] < share)
     profile = dict(system.tail_misfit)
@@ -268,7 +273,8 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
             above = log(highest[seen & (highest > part / LESS)]) - middle
             chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
             with_it = np.count_nonzero(alike)
-            if with_it >= max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1)):
+            least_number = max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1))
+            if with_it >= least_number and len(np.unique(tenth[alike])) >= PLACES:
                 likely.append((with_it - without, alike))
         if likely:
             alike = max(likely, key=lambda one: one[0])[1]
