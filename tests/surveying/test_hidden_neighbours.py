@@ -1,4 +1,4 @@
-"""Errors of times hold neighbours that are too close to be found, as far as the strip's pairs tell."""
+"""Errors hold neighbours that are too close to be found, as far as the strip's pairs tell."""
 
 from dataclasses import replace
 
@@ -17,14 +17,19 @@ ACCURATE = load_profile("accurate")
 
 
 def scaled_errors(scene, system, block, truth):
-    """Errors of clear echoes over the reported ones: without a flag, and with one."""
+    """Errors of clear echoes over the reported ones, of time, amplitude, energy: without a flag, and with one."""
     found = ACCURATE.run(block, system)
     match = match_echoes(found, truth)
     clear = truth.amplitude[match.truth] > 10 * find_scene(scene).recording.recorded_noise
     found, at = found.take(match.found[clear]), match.truth[clear]
-    scaled = (found.time - truth.time[at]) / found.time_err
+    energy = found.amplitude * found.sigma
+    scaled = np.stack([
+        (found.time - truth.time[at]) / found.time_err,
+        (found.amplitude - truth.amplitude[at]) / found.amplitude_err,
+        (1 - truth.amplitude[at] * truth.sigma[at] / energy) / found.relative_energy_err,
+    ])  # fmt: skip
     flagged = (found.flags & np.uint16(UNCLEAN)) != 0
-    return scaled[~flagged], scaled[flagged]
+    return scaled[:, ~flagged], scaled[:, flagged]
 
 
 def rms(values):
@@ -33,18 +38,22 @@ def rms(values):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["forest", "mixed", "urban"])
-def test_errors_of_times_cover_hidden_neighbours(scene):
+def test_errors_cover_hidden_neighbours(scene):
     """Over three strips, since each survey knows its strip's pairs to a fifth only."""
     bare, covered = [], []
     for seed in (5, 6, 7):
         block, truth = simulate_block(scene, 5000, np.random.default_rng(seed))
         system = survey_block(block).system
-        bare.append(scaled_errors(scene, replace(system, hidden=()), block, truth))
+        bare.append(scaled_errors(scene, replace(system, hidden=(), hidden_light=()), block, truth))
         covered.append(scaled_errors(scene, system, block, truth))
-    assert min(rms(np.concatenate(kind)) for kind in zip(*bare, strict=True)) > 2
-    plain, flagged = (rms(np.concatenate(kind)) for kind in zip(*covered, strict=True))
-    assert 0.7 < plain < 1.2
-    assert 0.8 < flagged < 1.3
+    bare, covered = ([np.hstack(kind) for kind in zip(*pairs, strict=True)] for pairs in (bare, covered))
+    assert min(rms(kind[0]) for kind in bare) > 2
+    assert 0.7 < rms(covered[0][0]) < 1.2
+    assert 0.8 < rms(covered[1][0]) < 1.3
+    for kind, before in zip(covered, bare, strict=True):
+        within = np.mean(np.abs(kind[1:]) < 1, axis=1)
+        assert (within > 0.65).all() and (within < 0.9).all()
+        assert (rms(kind[1]) < 0.6 * rms(before[1])) and (rms(kind[2]) < 0.6 * rms(before[2]))
 
 
 def test_a_strip_of_lone_echoes_has_the_errors_of_the_fit():
@@ -53,10 +62,15 @@ def test_a_strip_of_lone_echoes_has_the_errors_of_the_fit():
 
 
 def test_the_cover_is_that_of_a_loop(rng):
-    system = SystemPulse(1.5, hidden=((0.1, 0.2, 0.05), (0.4, 0.3, 0.1), (1.6, 0.1, 0.02)))
+    system = SystemPulse(
+        1.5,
+        hidden=((0.1, 0.2, 0.05), (0.4, 0.3, 0.1), (1.6, 0.1, 0.02)),
+        hidden_light=((0.2, 0.02, 0.1), (0.8, 0.3, 0.01)),
+    )
     waveform = np.sort(rng.integers(0, 40, 60)).astype(np.int32)
     sigma = rng.uniform(1.2, 3.5, 60)
     errors = {"time_err": rng.uniform(0, 0.1, 60), "sigma_err": rng.uniform(0, 0.2, 60)}
+    errors |= {"amplitude_err": rng.uniform(0, 2, 60), "relative_energy_err": rng.uniform(0, 0.1, 60)}
     table = EchoTable.build(waveform, rng.uniform(0, 50, 60), np.full(60, 40.0), sigma, **errors)
     covered = cover_hidden(table, system, 40)
     lone, others = 0, 0
@@ -68,5 +82,12 @@ def test_the_cover_is_that_of_a_loop(rng):
         share = np.interp(excess, [0.1, 0.4, 1.6], [0.2, 0.3, 0.1] if alone else [0.05, 0.1, 0.02])
         expected = np.sqrt(float(table.time_err[i]) ** 2 + share * excess * 1.5**2)
         assert covered.time_err[i] == pytest.approx(expected, rel=1e-5)
+        light = np.sqrt(excess) * np.interp(excess, [0.2, 0.8], [0.02, 0.3] if alone else [0.1, 0.01])
+        height, energy = table.amplitude_err[i], table.relative_energy_err[i]
+        assert covered.amplitude_err[i] == pytest.approx(np.hypot(height, light * 40.0), rel=1e-5)
+        assert covered.relative_energy_err[i] == pytest.approx(np.hypot(energy, light), rel=1e-5)
     assert lone and others
+    earlier = cover_hidden(table, replace(system, hidden_light=()), 40)  # a survey of an earlier version
+    assert np.array_equal(earlier.time_err, covered.time_err)
+    assert np.array_equal(earlier.amplitude_err, table.amplitude_err)
     assert cover_hidden(table, replace(system, hidden=()), 40) is table

@@ -46,6 +46,7 @@ SYSTEM = SystemPulse(
     beside=((-9.3, 0.25), (5.574348636365153, 0.1 + 0.7)),
     misfit=0.1 / 3,
     hidden=((0.035, 1 / 7, 0.0), (0.07, 0.1 + 0.2, 1e-9)),
+    hidden_light=((0.035, 2 / 7, 0.0), (0.07, 0.1 + 0.3, 1e-9)),
 )
 SURVEY = Survey(
     SYSTEM,
@@ -149,11 +150,11 @@ def test_without_saturation_nothing_clips():
 
 def test_files_of_earlier_versions_are_read():
     """They have no correlation, no tail, no misfit and nothing of what is left beside echoes."""
-    text = re.sub(r"^(correlation|whitening|tail_misfit|beside|misfit|hidden) = .*\n", "", TEXT, flags=re.M)
-    assert text.count("\n") == TEXT.count("\n") - 6
+    text = re.sub(r"^(correlation|whitening|tail_misfit|beside|misfit|hidden(_light)?) = .*\n", "", TEXT, flags=re.M)
+    assert text.count("\n") == TEXT.count("\n") - 7
     system = parse_survey(text, "x").survey.system
     noise = replace(SYSTEM.noise, correlation=(), whitening=())
-    assert system == replace(SYSTEM, noise=noise, tail_misfit=(), beside=(), misfit=0.0, hidden=())
+    assert system == replace(SYSTEM, noise=noise, tail_misfit=(), beside=(), misfit=0.0, hidden=(), hidden_light=())
 
 
 @pytest.mark.parametrize(

@@ -476,6 +476,13 @@ class SystemPulse:
     """What neighbours that were not found do to times: variance of an echo over that of the pulse, less 1; and the
     variance of its time over that excess, of lone echoes and of others (docs/algorithms.md 2.2). Empty for none.
     """
+    hidden_light: Annotated[
+        tuple[tuple[Annotated[float, Range(0.0, 1e4)], _Times, _Times], ...],
+        Key("hidden_light",
+            "(excess variance of a width, share of light over its root of lone and other echoes) by unseen neighbours",
+            form="[excess, lone, others]"),
+    ] = ()  # fmt: skip
+    """What they add to light: excess variance; mean share of an echo's light that is theirs, over the excess's root."""
     other_pulse: bool = False
     """Whether the echoes of a block were fitted with another pulse than the survey's; set while a chain runs."""
     digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)

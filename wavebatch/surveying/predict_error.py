@@ -211,7 +211,7 @@ _CUT = UNCLEAN & ~(EchoFlag.OVERLAPPED | EchoFlag.MERGED)
 
 
 def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
-    """Find how far hidden neighbours move echoes, from the strip's own rate of close pairs.
+    """Find how far hidden neighbours move echoes, and how much light they add, from the strip's rate of close pairs.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     Returns
     -------
     SystemPulse
-        With `hidden`; unchanged where too few echoes lie close together.
+        With `hidden` and `hidden_light`; unchanged where too few echoes lie close together.
 
     Notes
     -----
@@ -237,18 +237,20 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     if not (lone.any() or others.any()):
         return system
     # Too few groups of three: another neighbour is then as likely as a first one.
-    rows = np.stack([_MIDDLE, lone, others if others.any() else lone], axis=1)
-    return replace(system, hidden=tuple(map(tuple, rows.tolist())))
+    both = zip(lone, others if others.any() else lone, strict=True)
+    times, light = (tuple(map(tuple, np.stack([_MIDDLE, *pair], axis=1).tolist())) for pair in both)
+    return replace(system, hidden=times, hidden_light=light)
 
 
 def _measure_class(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, number: np.ndarray, company: bool
 ) -> np.ndarray:
-    """Mean square of the shift over the excess variance, of echoes with (company) or without another in their waveform.
+    """Mean square of the shift over the excess variance, and mean share of others' light over its root (2, classes).
 
-    number: echoes in the waveform of each. An echo that hides another was in a waveform with one more.
+    Of echoes with (company) or without another in their waveform. number: echoes in the waveform of each. An echo that
+    hides another was in a waveform with one more.
     """
-    nothing, source = np.zeros(len(_MIDDLE)), number > 2 if company else number == 2
+    nothing, source = np.zeros((2, len(_MIDDLE))), number > 2 if company else number == 2
     pick = np.flatnonzero(source & ((echoes.flags & np.uint16(_CUT)) == 0))
     near = 0  # pairs of echoes of one waveform from NEAR to FAR apart
     for step in (1, 2, 3):
@@ -257,7 +259,7 @@ def _measure_class(
         near += int(np.count_nonzero(same & (gap >= NEAR) & (gap < FAR)))
     if len(pick) < FEW or not near:
         return nothing
-    excess, shift = _hide_pairs(block, system, echoes.take(pick))
+    excess, shift, light = _hide_pairs(block, system, echoes.take(pick))
     expected = near / (FAR - NEAR) * FAR / min(PAIRS, len(block))
     if company:
         # A group with one more, hidden echo looks smaller: its near pair was not counted.
@@ -266,12 +268,16 @@ def _measure_class(
     clear = (echoes.amplitude > CLEAR * system.noise.std) & ((number > 1) if company else (number == 1))
     there = np.histogram(excess_variance(echoes.take(np.flatnonzero(clear)), system), EXCESS)[0]
     hidden = expected * np.histogram(excess, EXCESS)[0]
-    moved = expected * np.histogram(excess, EXCESS, weights=shift**2 / np.maximum(excess, EXCESS[0]))[0]
-    return moved / np.maximum(np.maximum(there, hidden), 1.0)
+    least = np.maximum(excess, EXCESS[0])
+    weights = shift**2 / least, np.abs(light) / np.sqrt(least)
+    sums = expected * np.stack([np.histogram(excess, EXCESS, weights=weight)[0] for weight in weights])
+    return sums / np.maximum(np.maximum(there, hidden), 1.0)
 
 
-def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[np.ndarray, np.ndarray]:
-    """Excess variance, and distance to the nearer target [widths of the pulse], of pairs that are found as one echo."""
+def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[np.ndarray, ...]:
+    """Excess variance of pairs that are found as one echo, its distance to the nearer target [widths of the pulse] and
+    the share of its light that is not that target's.
+    """
     rng = np.random.default_rng(SEED)
     block = block.rows(slice(0, PAIRS))
     n, ref = len(block), system.sigma_ref
@@ -283,5 +289,7 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     found = decompose_sample(*simulate_again(block, system, pairs, rng, length))
     one = found.alone(n) & (found.amplitude > CLEAR * system.noise.std)
     found = found.take(np.flatnonzero(one))
-    shift = np.abs(time[found.waveform] - found.time[:, None]).min(axis=1)
-    return excess_variance(found, system), shift / ref
+    away = np.abs(time[found.waveform] - found.time[:, None])
+    nearer = pairs.take(2 * found.waveform + away.argmin(axis=1))
+    light = 1.0 - (nearer.amplitude * nearer.sigma).astype(np.float64) / (found.amplitude * found.sigma)
+    return excess_variance(found, system), away.min(axis=1) / ref, light

@@ -96,7 +96,7 @@ def merge_unresolved(table: EchoTable) -> EchoTable:
 
 
 def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
-    """Enlarge the errors of times by the effect of neighbours that were not found.
+    """Enlarge the errors of times, amplitudes and energies by the effect of neighbours that were not found.
 
     Parameters
     ----------
@@ -114,15 +114,23 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
     Notes
     -----
     An echo that hides another is wider than the pulse. Among echoes of one width the root mean square of their errors
-    is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2).
+    is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2). Of light it is the mean: few
+    echoes have a third of theirs from another target, and the root mean square would be the error of hardly any.
     """
     if not system.hidden:
         return table
-    excess, lone, others = np.array(system.hidden).T
-    wider = np.maximum(excess_variance(table, system), 0.0)
-    share = np.where(table.alone(n), *interpolate(wider, excess, np.stack([lone, others], axis=1)).T)
-    error = np.sqrt(table.time_err**2 + share * wider * system.sigma_ref**2)
-    return replace(table, time_err=error.astype(np.float32))
+    wider, alone = np.maximum(excess_variance(table, system), 0.0), table.alone(n)
+    late, share = (
+        np.where(alone, *interpolate(wider, rows[:, 0], rows[:, 1:]).T)
+        for rows in map(np.array, (system.hidden, system.hidden_light or ((0.0, 0.0, 0.0),)))
+    )
+    light = share * np.sqrt(wider)  # of amplitude and energy alike
+    covered = {
+        "time_err": np.sqrt(table.time_err**2 + late * wider * system.sigma_ref**2),
+        "amplitude_err": np.hypot(table.amplitude_err, light * table.amplitude),
+        "relative_energy_err": np.hypot(table.relative_energy_err, light),
+    }
+    return replace(table, **{name: error.astype(np.float32) for name, error in covered.items()})
 
 
 def excess_variance(table: EchoTable, system: SystemPulse) -> np.ndarray:
