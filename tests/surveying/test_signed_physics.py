@@ -160,6 +160,11 @@ def test_a_wrong_divergence_is_named_and_in_the_errors(tmp_path, factor):
     rows = true["pure"] & np.isfinite(columns["cross_section"])
     off = np.abs(columns["cross_section"] - section)[rows] / columns["cross_section_err"][rows]
     assert 0.6 < np.median(off) < 1.1
+    # Voxels name it as well; they have factor^2 of the true cross section.
+    voxels = call("voxelize", tmp_path / "strip.las", "--size", 5, "--calibration", wrong, "-o", tmp_path / "v.npz")
+    assert f"a beam of {factor * GREEN.divergence:g} mrad contradicts" in voxels.output
+    shared = json.loads(str(np.load(tmp_path / "v.npz")["meta"]))["cross_section_error"]
+    assert shared == pytest.approx(3.0 if factor == 0.5 else 1.0, rel=0.1)
     # A saved survey that has seen the beam knows it, too.
     call("survey", tmp_path / "strip.las", "--divergence", wide := factor * GREEN.divergence, "-o", tmp_path / "s.toml")
     options = ("--calibration", wrong, "--system", tmp_path / "s.toml", "--columns", "cross_section,cross_section_err")

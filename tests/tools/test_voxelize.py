@@ -434,8 +434,9 @@ def test_cross_sections_are_those_of_the_echoes(level, tmp_path):
     assert summary.sensor == "direction vectors" and summary.unknown == 0
     assert np.sum(found["cross_section"], dtype=np.float64) == pytest.approx(expected.sum(), rel=0.02)
     assert list(found)[:3] == ["index", "energy", "cross_section"]
+    assert 0.03 < summary.cross_section_error < 0.032  # the constant's, and what ranges add
     again, _ = voxelize(level, tmp_path / "w.npz", 1.0)
-    assert again.sensor is None and again.energy == summary.energy
+    assert again.sensor is None and again.energy == summary.energy and again.cross_section_error is None
 
 
 @pytest.fixture(scope="module")

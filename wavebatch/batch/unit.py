@@ -9,7 +9,6 @@ Before you change it: all that travels between processes must be picklable, and 
 from __future__ import annotations
 
 import functools
-import math
 import pickle
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -224,13 +223,7 @@ def _see_level(
         seen = GroundReference(used, 0, beam, (figures.divergence_seen_error_mrad or 0.0) / (beam or 1.0))
     else:
         seen = sample_reference(reader, scan, sensor, used, figures.spacing_ns or 0.0)
-    doubt = seen.doubt()
-    error = survey.system.radiometry.divergence_error
-    if doubt and seen.divergence and divergence:
-        # Cross sections go with the square, so that a beam twice as wide makes them four times as large, not three.
-        ratio = seen.divergence / divergence
-        ratio *= 1.0 + math.copysign(seen.divergence_error, ratio - 1.0)
-        error = abs(ratio - 1.0) * max(1.0, 0.5 * (ratio + 1.0))
+    doubt, error = seen.doubt(), seen.doubt_error() or survey.system.radiometry.divergence_error
     system = _take_reference(survey.system, seen.system).with_radiometry(divergence_error=error)
     return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()
 

@@ -282,6 +282,8 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
     for text, number in notes.items():
         if number:
             yield f"note: {count(number, 'pulse')} {text}"
+    if summary.cross_section_error is not None:
+        yield f"cross sections: {100 * summary.cross_section_error:.2g} % of error that all share"
     if summary.several_packets:
         hidden = ""
         if summary.hidden_light is not None:

@@ -13,6 +13,7 @@ you change it: stage attribute.incidence_angle must use the same limits, or pred
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -106,6 +107,16 @@ class GroundReference:
             f"a beam of {format_measure(self.divergence, self.divergence * self.divergence_error)} mrad do: "
             "cross sections and angles are wrong unless the surfaces are rough; check divergence_mrad"
         )
+
+    def doubt_error(self) -> float | None:
+        """Relative error of the system's divergence where the widths contradict it; None where they do not."""
+        given = self.system.radiometry.divergence
+        if not given or not self.divergence or not self.doubt():
+            return None
+        # Cross sections go with the square, so that a beam twice as wide makes them four times as large, not three.
+        ratio = self.divergence / given
+        ratio *= 1.0 + math.copysign(self.divergence_error, ratio - 1.0)
+        return abs(ratio - 1.0) * max(1.0, 0.5 * (ratio + 1.0))
 
 
 def choose_radius(reader: StripReader, scan: StripScan) -> float:

@@ -6,6 +6,7 @@ output must not depend on batches, so nothing here may mix pulses of a batch.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import MISSING, asdict, dataclass, field, replace
@@ -21,7 +22,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import Radiometry, SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
@@ -31,8 +32,10 @@ from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
+from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request, widest_chain
+from wavebatch.surveying.flat_ground import GroundReference, sample_reference
 from wavebatch.surveying.inspect_strip import name_gains
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
@@ -58,6 +61,10 @@ _MOST_FITTING = 0.9
 MOST_MISSING = 0.05
 """Share of the returns that may be missing from a file, or of the pulses that may be found in parts: the border of a
 tile cuts fewer, thinning and sorting more."""
+
+
+USUAL = 1000.0
+"""Distance [m] for the error of the air where that of the strip is not known."""
 
 
 @frozen
@@ -100,6 +107,8 @@ class VoxelSummary:
     """Noise of a sample [DN]."""
     sensor: str | None
     """Source of the sensor's positions; None without calibration."""
+    cross_section_error: float | None
+    """Relative standard deviation that all cross sections share; None without calibration."""
     warnings: tuple[str, ...]
     """Why cross sections may be less sure than the calibration says."""
     reflectance_ratio: float
@@ -199,14 +208,16 @@ def voxelize_strip(
         setup = prepare(reader, scan, widest_chain(), Request(auto=True, system=system, force=force), sensor=sensor,
                         positions=positions, calibration=calibration, energy=options.energy)  # fmt: skip
         source, pulse, energy = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.sent.energy
-        doubts = (*setup.doubts, *(setup.sent.notes if calibration else ()))
+        doubts, section_error = (*setup.doubts, *(setup.sent.notes if calibration else ())), None
         if calibration is not None:
-            doubts += tuple(filter(None, [source.doubt()]))
             if pulse.radiometry.divergence is None:
                 raise ConfigError(
                     "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration "
                     "or give a --system file that has it"
                 )
+            beam = sample_reference(reader, scan, source, pulse, setup.choice.survey.figures.spacing_ns or 0.0)
+            doubts += tuple(filter(None, [source.doubt(), beam.doubt()]))
+            section_error = _measure_error(setup.system.radiometry, beam, source.distance)
         middle = _find_middle(reader, scan, options)
         floor, ceiling, shown = rays.Floor(middle), rays.Ceiling(middle, options.size), np.zeros(256, np.int64)
         for begin, end in pairwise(scan.borders.tolist()):
@@ -246,7 +257,8 @@ def voxelize_strip(
             summary = VoxelSummary(
                 strip=str(strip), output=str(target), size=grid.size, method=options.deconvolution.method,
                 pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA, noise=pulse.noise.std, warnings=doubts,
-                sensor=None if calibration is None else source.kind, reflectance_ratio=rule.ratio,
+                sensor=None if calibration is None else source.kind, cross_section_error=section_error,
+                reflectance_ratio=rule.ratio,
                 reflectance_ratio_err=rule.error, reflectance_ratio_source=rule.source, hidden_light=rule.hidden_light,
                 profiles=None if profiles is None else str(profiles),
             )  # fmt: skip
@@ -263,6 +275,7 @@ def voxelize_strip(
             meta = _describe(strip, options, grid, pulse, calibration) | {
                 "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source},
                 "hidden_light": rule.hidden_light,
+                "cross_section_error": section_error,
             }
             meta["pulse_energy"] = None if energy is None else energy.describe()
             space = voxel_grid.VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
@@ -282,6 +295,16 @@ def voxelize_strip(
             split = summary.several_packets > 0 or scan.with_waveform == scan.packets
             summary.warnings += (*_doubt_returns(shown.reshape(16, 16), summary.pulses, split),)
             return summary
+
+
+def _measure_error(radiometry: Radiometry, beam: GroundReference, distance: float | None) -> float:
+    """Relative error that all cross sections of a strip share: of constant, air, ranges and beam."""
+    constant = max((error for _, error in radiometry.channels.values()), default=radiometry.constant_error)
+    shared = backscatter_error(
+        np.zeros(1), np.array([distance or USUAL]), radiometry.sensor_error, constant, radiometry.attenuation,
+        power=4, attenuation_err=radiometry.attenuation_error,
+    )  # fmt: skip
+    return math.hypot(float(shared[0]), 2.0 * (beam.doubt_error() or radiometry.divergence_error))
 
 
 def _doubt_returns(shown: np.ndarray, found: int, split: bool) -> Iterator[str]:
