@@ -415,45 +415,43 @@ EXPORT int64_t render_pulses(const Described *w, float *out) {
 
 typedef uint8_t bytes __attribute__((vector_size(LANES)));
 
-INLINE lane_bits read_flags(const uint8_t *a, const uint8_t *b, size_t count, int any) {
-    bytes first = {0}, second = {0};
-    memcpy(&first, a, count);
-    memcpy(&second, b, count);
-    return __builtin_convertvector(any ? first | second : first & second, lane_bits) != 0;
-}
-
 enum { PAIR_KINDS = 4, PAIRS_TOGETHER = 256 }; /* vectors whose squares are added in single precision: 1e-6 of their sum */
+enum { HIGH = 1, LOW = 2 };
 
 typedef struct { lane_bits number[PAIR_KINDS]; lanes square[PAIR_KINDS]; } PairSums;
 
-/* The next `count` pairs, at most LANES. */
-INLINE void add_pairs(const float *a, int64_t ahead, const uint8_t *quiet, const uint8_t *high, const uint8_t *low, size_t count,
-                      int64_t kinds, PairSums *sums) {
-    lanes first = ALL(0), second = ALL(0);
-    memcpy(&first, a, count * sizeof(float));
-    memcpy(&second, a + ahead, count * sizeof(float));
-    lane_bits is[PAIR_KINDS] = {read_flags(quiet, quiet + ahead, count, 0)};
-    if (kinds > 1) {
-        is[1] = is[0] & read_flags(high, high + ahead, count, 1);
-        is[2] = is[0] & read_flags(low, low + ahead, count, 1);
-        is[3] = is[1] & is[2];
-    }
-    const lanes step = second - first, square = step * step;
-    for (int64_t k = 0; k < kinds; k++) {
-        sums->number[k] -= is[k];
-        sums->square[k] += (lanes)(is[k] & (lane_bits)square);
-    }
+INLINE void add_kind(lane_bits is, lanes square, int64_t kind, PairSums *sums) {
+    sums->number[kind] -= is;
+    sums->square[kind] += (lanes)(is & (lane_bits)square);
 }
 
-INLINE void add_all_pairs(int64_t end, const float *signal, int64_t ahead, const uint8_t *quiet, const uint8_t *high,
-                          const uint8_t *low, int64_t kinds, double *out) {
+/* The next `count` pairs, at most LANES. */
+INLINE void add_pairs(const float *a, const uint8_t *marks, int64_t ahead, size_t count, PairSums *sums) {
+    lanes first = ALL(NAN), second = ALL(NAN);
+    memcpy(&first, a, count * sizeof(float));
+    memcpy(&second, a + ahead, count * sizeof(float));
+    const lanes step = second - first, square = step * step;
+    const lane_bits quiet = step == step;      /* a sample that is not quiet is no number */
+    add_kind(quiet, square, 0, sums);
+    if (!marks) return;
+    bytes one = {0}, other = {0};
+    memcpy(&one, marks, count);
+    memcpy(&other, marks + ahead, count);
+    const lane_bits both = __builtin_convertvector(one | other, lane_bits);
+    const lane_bits is_high = quiet & ((both & HIGH) != 0), is_low = quiet & ((both & LOW) != 0);
+    add_kind(is_high, square, 1, sums);
+    add_kind(is_low, square, 2, sums);
+    add_kind(is_high & is_low, square, 3, sums);
+}
+
+INLINE void add_all_pairs(int64_t end, const float *signal, const uint8_t *marks, int64_t ahead, double *out) {
     for (int64_t i = 0; i < end;) {
         PairSums sums = {0};
         int64_t most = i + PAIRS_TOGETHER * LANES, last = most < end ? most : end;
-        for (; i + LANES <= last; i += LANES) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, LANES, kinds, &sums);
-        if (i < last) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, last - i, kinds, &sums);
+        for (; i + LANES <= last; i += LANES) add_pairs(signal + i, marks ? marks + i : NULL, ahead, LANES, &sums);
+        if (i < last) add_pairs(signal + i, marks ? marks + i : NULL, ahead, last - i, &sums);
         i = last;
-        for (int64_t k = 0; k < kinds; k++)
+        for (int64_t k = 0; k < (marks ? PAIR_KINDS : 1); k++)
             for (int64_t lane = 0; lane < LANES; lane++) {
                 out[2 * k] += sums.number[k][lane];
                 out[2 * k + 1] += sums.square[k][lane];
@@ -461,12 +459,12 @@ INLINE void add_all_pairs(int64_t end, const float *signal, int64_t ahead, const
     }
 }
 
-/* Pairs of quiet samples `lag` apart of waveforms in columns, signal (s, n): number, and sum of squared differences, of
-   all pairs, of those with a sample of `high`, of `low`, and of both: out (4, 2), zeros. Without masks only the first. */
-EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const uint8_t *quiet, const uint8_t *high,
-                                const uint8_t *low, int64_t lag, double *out) {
+/* Pairs of quiet samples `lag` apart of waveforms in columns, signal (s, n), no number where it is not quiet: number and
+   sum of squared differences of all pairs, of those with a sample of mark HIGH, of LOW, and of both: out (4, 2), zeros.
+   Without marks (s, n) only the first. */
+EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const uint8_t *marks, int64_t lag, double *out) {
     const int64_t ahead = lag * n, end = (s - lag) * n;
-    if (high) add_all_pairs(end, signal, ahead, quiet, high, low, PAIR_KINDS, out);
-    else add_all_pairs(end, signal, ahead, quiet, quiet, quiet, 1, out);
+    if (marks) add_all_pairs(end, signal, marks, ahead, out);
+    else add_all_pairs(end, signal, NULL, ahead, out);
     return 0;
 }

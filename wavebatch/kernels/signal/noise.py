@@ -400,10 +400,8 @@ def measure_covariance(
     float64 (k,) or None
         k <= 1 + MOST_LAGS. None where fewer than LEAST_QUIET_PAIRS neighbours are quiet.
     """
-    signal, quiet = np.ascontiguousarray(signal, np.float32), np.ascontiguousarray(quiet)
-    masks: list[np.ndarray | None] = [None, None]
-    if mirrored is not None:
-        masks = [np.ascontiguousarray(mask) for mask in mirrored]
+    alone = np.where(quiet, np.asarray(signal, np.float32), np.float32(np.nan))
+    marks = None if mirrored is None else np.ascontiguousarray(mirrored[0] + np.uint8(2) * mirrored[1])
     half: list[float] = []
     pairs: list[float] = []
     # In fewer waveforms than `measure_recovery` needs a tail of echoes looks like slow noise.
@@ -412,7 +410,7 @@ def measure_covariance(
         # Slow noise: a variogram is higher at each of its last lags than at those before.
         if lag > lags and not (min(half[-RISE:]) > max(half[-2 * RISE : -RISE])):
             break
-        number, square = _pair_differences(signal, quiet, masks, lag)
+        number, square = _pair_differences(alone, marks, lag)
         if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
             break
         half.append(0.5 * square / number)
@@ -431,15 +429,16 @@ def measure_covariance(
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
 
 
-def _pair_differences(
-    signal: np.ndarray, quiet: np.ndarray, masks: list[np.ndarray | None], lag: int
-) -> tuple[float, float]:
-    """Pairs of quiet samples `lag` apart and the sum of their squared differences; masks: as `mirrored`, or None."""
+def _pair_differences(quiet: np.ndarray, marks: np.ndarray | None, lag: int) -> tuple[float, float]:
+    """Pairs of samples `lag` apart and the sum of their squared differences.
+
+    quiet: float32 (s, n), the quiet samples; NaN for others. marks: uint8 (s, n), 1 and 2 by the masks of `mirrored`.
+    """
     found = np.zeros((4, 2))
-    given = [ctypes.c_void_p(None) if mask is None else mask for mask in masks]
-    call("pair_differences", *map(ctypes.c_int64, signal.shape), signal, quiet, *given, ctypes.c_int64(lag), found)
+    given = ctypes.c_void_p(None) if marks is None else marks
+    call("pair_differences", *map(ctypes.c_int64, quiet.shape), quiet, given, ctypes.c_int64(lag), found)
     every, high, low, both = found
-    if masks[0] is None:
+    if marks is None:
         return float(every[0]), float(every[1])
     noise = min((low[0] - both[0]) / max(high[0] - both[0], 1.0), 1.0)
     number, square = every + low - high - (1 - noise) * both
