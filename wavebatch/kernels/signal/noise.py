@@ -256,7 +256,7 @@ def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float
     values = smooth_121(np.where(quiet, signal - np.nan_to_num(level), np.float32(0)))[1:-1][inner]
     if len(values) < LEAST_PAIRS or np.std(values) < QUANTISATION_STD:
         return 1.0
-    if np.mean(signal[1:-1][inner] == signal.min()) > MOST_LEAST:
+    if np.count_nonzero(inner & (signal[1:-1] == signal.min())) > MOST_LEAST * len(values):
         return 1.0
     values = values - median(values)
     above, below = (float(np.sum(np.square(values[side]), dtype=np.float64)) for side in (values > 0, values < 0))
@@ -423,8 +423,8 @@ def measure_covariance(
     rest = sill - np.array(half)
     chance = CHANCE * sill / np.sqrt(pairs)
     if len(half) >= RISE and pairs[-1] >= LEAST_PAIRS:
-        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), signal, quiet)
-        if slow is not None and slow[0] > (1 + SETTLED) * sill:
+        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), signal, quiet, (1 + SETTLED) * sill)
+        if slow is not None:
             return slow
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
 
@@ -446,12 +446,12 @@ def _pair_differences(quiet: np.ndarray, marks: np.ndarray | None, lag: int) -> 
 
 
 def _extend(
-    half: np.ndarray, pairs: np.ndarray, lags: int, signal: np.ndarray, quiet: np.ndarray
+    half: np.ndarray, pairs: np.ndarray, lags: int, signal: np.ndarray, quiet: np.ndarray, least: float
 ) -> np.ndarray | None:
     """Covariance (1 + lags,) of noise that forgets itself by one factor a sample, from a variogram that is too short.
 
     Its sill is what the variogram tends to, and at most the variance of all quiet samples, with that of their levels.
-    None where no such noise has this variogram.
+    None where no such noise has this variogram, or none whose sill is above `least`.
     """
     factor = np.linspace(0.0, MOST_SLOW, 50)
     power = np.cumprod(np.repeat(factor[:, None], lags, axis=1), axis=1)
@@ -461,7 +461,11 @@ def _extend(
     best = int(np.argmin(np.einsum("fk,fk,k->f", rest, rest, pairs)))
     if (np.abs(rest[best]) > ALIKE_SHAPE / np.sqrt(pairs) * slow[-1]).any():
         return None
-    sill = min(float(size[best]) + QUANTISATION_STD**2, float(np.var(signal[quiet], dtype=np.float64)))
+    sill = float(size[best]) + QUANTISATION_STD**2
+    if sill > least:  # the variance of all takes longer than the rest
+        sill = min(sill, float(np.var(signal[quiet], dtype=np.float64)))
+    if sill <= least:
+        return None
     return np.r_[sill, sill - half, max(sill - half[-1], 0.0) * power[best, : lags - len(half)]]
 
 
