@@ -11,6 +11,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
+from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 
@@ -153,6 +154,25 @@ def test_leica_is_what_is_known_of_it(leica):
     # Coloured noise (.6, .55, .4 ...): what it does to the amplitude of a pulse is twice the noise of a sample.
     assert system.noise.std == pytest.approx(1.7, abs=0.15) and misfits.empty_share == 0
     assert system.noise.correlation[:3] == pytest.approx((0.6, 0.54, 0.36), abs=0.08)
+
+
+def test_a_sample_is_decomposed_again_only_where_it_has_other_echoes():
+    block = make_block("mixed", 200)[0]
+    system = survey_block(block).system
+    echoes = decompose_sample(block, system)
+    noise = replace(system.noise, by_kind={**system.noise.by_kind, "core": 9.0})
+    assert decompose_again(block, replace(system, noise=noise, faint_share=0.5), system, echoes) is echoes
+    noise = replace(system.noise, by_kind={**system.noise.by_kind, "quiet": 0.5 * system.noise.quiet})
+    others = [replace(system, **change) for change in (
+        {"misfit": 0.1}, {"significance": 6.0}, {"noise": noise}, {"tail_misfit": ((9.0, 0.1),)}
+    )]  # fmt: skip
+    for other in others:
+        found, expected = decompose_again(block, other, system, echoes), decompose_sample(block, other)
+        assert found is not echoes
+        assert np.array_equal(found.amplitude_err, expected.amplitude_err)
+    learned = replace(system, components=((0.1, 4.0, 1.0),))
+    faint = replace(learned, faint_share=0.5)
+    assert decompose_again(block, faint, learned, echoes) is not echoes
 
 
 def test_a_survey_depends_on_the_samples_only():

@@ -45,7 +45,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     measure_whole,
     thin_samples,
 )
-from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
+from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures
@@ -251,7 +251,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             noise = measure_once_more(block, system)
             if narrower or noise.by_kind["quiet"]:
                 system = replace(system, noise=replace(noise, gain=first.noise.gain))
-        echoes = decompose_sample(part, bear(system, choice.best.change))
+        borne = bear(system, choice.best.change)
+        echoes = decompose_sample(part, borne)
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
@@ -265,7 +266,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
-        echoes = decompose_sample(part, system)
+        echoes = decompose_again(part, system, borne, echoes)
         # A misfit for what fits leave allows no more faint echoes beside strong ones: that by the description does.
         misfit, left = cover_fits(system, echoes, block.spacing)
         if misfit > system.misfit:

@@ -460,7 +460,9 @@ def _choose_misfit(
         """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
         for place in places:
             if place not in found:
-                looked = found[place] = _explain_between(block, at(MISFITS[place]), changes, found, place)
+                found[place] = _explain_between(block, at(MISFITS[place]), changes, found, place)
+            if place not in lengths:
+                looked = found[place]
                 lengths[place] = describe_waveforms(block, system, looked.explained, changes, looked.left)
         tried = product(sorted(lengths), range(len(changes)))
         best, change = min(tried, key=lambda one: lengths[one[0]][one[1]].mean())
@@ -470,6 +472,9 @@ def _choose_misfit(
     # From coarse to fine, and no further down or up than echoes are false, or lost, for sure. Each step looks first at
     # its ends: what they explain alike is not fitted again.
     middle = 6 if COVERED * change > MISFITS[5] else 2
+    for end in (0, len(MISFITS) - 1):
+        if middle == 2:  # the largest is nearly always looked at, and few waveforms lie between the two
+            found[end] = _explain_between(block, at(MISFITS[end]), changes, found, end)
     best, longer = look(middle - 2, middle + 2, middle)
     while longer[0] < SURE and min(lengths) > 0:
         best, longer = look(min(lengths) - 4, min(lengths) - 2)

@@ -79,6 +79,17 @@ def decompose_sample(block: WaveformBlock, system: SystemPulse, **options: float
     return use_noise_errors(echoes, system, block.spacing)
 
 
+def decompose_again(block: WaveformBlock, system: SystemPulse, before: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """As `decompose_sample`, where the echoes that `before` found are known: they stay where it fits alike.
+
+    What the noise was chosen from, and what faint echoes of a plain Gaussian must exceed, change none of them.
+    """
+    noise = replace(system.noise, by_kind=before.noise.by_kind)
+    share = system.faint_share if system.components else before.faint_share
+    alike = replace(system, noise=noise, faint_share=share) == before and system.noise.quiet == before.noise.quiet
+    return echoes if alike else decompose_sample(block, system)
+
+
 def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """What fitted echoes leave of their waveforms.
 
