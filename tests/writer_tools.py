@@ -29,6 +29,14 @@ def data_file(name: str) -> Path:
     return folder / name
 
 
+def leave_out(monkeypatch, name: str) -> None:
+    """No shipped pulse has this name: its sensor is a stranger."""
+    from wavebatch.surveying.systems import known_systems as module
+
+    rest = tuple(one for one in module.known_systems() if one.name != name)
+    monkeypatch.setattr(module, "known_systems", lambda: rest)
+
+
 def read_raw(path: Path, backend: laspy.LazBackend = laspy.LazBackend.Lazrs) -> np.ndarray:
     """Raw records of a file; laspy never sees its extended records."""
     with laspy.open(path, laz_backend=backend, read_evlrs=False) as reader:

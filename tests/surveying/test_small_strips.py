@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 from strips import cut_strip
-from writer_tools import data_file
+from writer_tools import data_file, leave_out
 
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
-from wavebatch.surveying.systems import known_systems as module
 from wavebatch.surveying.systems.known_systems import MOST_DOUBTED, MOST_DOUBTED_KNOWN, find_source
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
@@ -20,12 +19,6 @@ TAIL = PulseModel(2.2, 0.0, ((0.06, 5.0, 4.0),))
 def _survey(path):
     with StripReader(path) as reader, reader.scan() as scan:
         return survey_blocks(read_sample(reader, scan))
-
-
-def _leave_out(monkeypatch, name):
-    """No shipped pulse of this name: its sensor is a stranger."""
-    rest = tuple(one for one in module.known_systems() if one.name != name)
-    monkeypatch.setattr(module, "known_systems", lambda: rest)
 
 
 @pytest.mark.quick_cases("flat, after-pulse")
@@ -61,7 +54,7 @@ def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path,
     whole = data_file("lvis/lvis1.las")
     path = cut_strip(whole, tmp_path / "cut.las", 50)
     assert MOST_DOUBTED_KNOWN < _survey(path).figures.echoes_in_doubt < 0.35
-    _leave_out(monkeypatch, "nasa-lvis")
+    leave_out(monkeypatch, "nasa-lvis")
     assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
     assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"
 

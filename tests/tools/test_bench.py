@@ -363,9 +363,11 @@ def test_bounds_know_clipping_and_noise_of_the_signal():
 
 
 def test_coloured_noise_counts_for_more():
-    for rho, factor in ((0.0, 1.0), (0.5, 1.29), (0.667, 1.39), (0.8, 1.48)):
-        stated = accuracy.effective_noise(Recording(noise_std=100.0, rho=rho))
-        assert stated == pytest.approx(100 * factor, rel=0.005)
+    one = table((0, 40.3, 50, 2.0))
+    white = accuracy.find_bounds(Recording(noise_std=100.0), one, 1)
+    for rho, factor in ((0.5, 1.29), (0.667, 1.39), (0.8, 1.48)):
+        bounds = accuracy.find_bounds(Recording(noise_std=100.0, rho=rho), one, 1)
+        assert bounds == pytest.approx(factor * white, rel=0.005)
 
 
 @pytest.mark.parametrize("pulse", ["gaussian", "skewed", "riegl", "leica"])

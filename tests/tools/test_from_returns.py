@@ -279,8 +279,6 @@ def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_pa
     number = np.array(las.number_of_returns)
     assert whole.light_used == pytest.approx(1) and first.light_used == pytest.approx(np.mean(1 / number))
     assert first.scattered == np.count_nonzero(number > 1)
-    starts = np.array([0, 2, 3])
-    assert returns.share_equally(np.array([2, 2, 4, 0, 0]), starts) == pytest.approx([0.5, 0.5, 0.25, 0.5, 0.5])
     words = ("-o", tmp_path / "x.las", "--intensity", "reflectance", "--sensor-height", 1200, "--overwrite")
     said = run(tmp_path / "first.las", *words, "--shares", "equal")
     assert "equal shares use number_of_returns, including missing returns" in said.stderr

@@ -108,12 +108,7 @@ class StripJob:
         return StripReader(self.path, direction=direction, headerless=headerless, unit_points=self.unit_points)
 
 
-def list_column_names(wanted: str | None) -> tuple[str, ...]:
-    """List the columns that a value of --columns names, in order."""
-    return tuple(entry.removeprefix("+") for entry in _split_columns(wanted) if entry.strip(" +"))
-
-
-def _split_columns(wanted: str | None) -> list[str]:
+def split_columns(wanted: str | None) -> list[str]:
     """The entries of --columns, with their `+`."""
     return [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
 
@@ -145,7 +140,7 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
         )
     computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
     default = [*computed, "echo_flags"]
-    entries = _split_columns(wanted)
+    entries = split_columns(wanted)
     added = [entry[1:] for entry in entries if entry.startswith("+")]
     chosen = [entry for entry in entries if not entry.startswith("+")]
     if wanted is not None and not entries:

@@ -68,9 +68,19 @@ class LazyGroup(NearestGroup):
 
 def _print_version(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
-        from wavebatch.cli.command import describe_version
+        import platform
+        from importlib import metadata
 
-        click.echo(describe_version())
+        from wavebatch import __version__
+        from wavebatch.cli.command import LIBRARIES
+
+        lines = [f"wavebatch {__version__}", f"Python {platform.python_version()}"]
+        for name in LIBRARIES:  # none of them is imported for it
+            try:
+                lines.append(f"{name} {metadata.version(name)}")
+            except metadata.PackageNotFoundError:
+                lines.append(f"{name} is not installed")
+        click.echo("\n".join(lines))
         context.exit()
 
 
@@ -79,7 +89,7 @@ def _write_man_pages(context: click.Context, parameter: click.Parameter, folder:
         from wavebatch.cli.command import write_man_pages
         from wavebatch.cli.messages import report_errors, talk
 
-        pages = report_errors()(write_man_pages)(main, folder)
+        pages = report_errors(write_man_pages)(main, folder)
         talk(f"{folder}: {len(pages)} manual pages written")
         context.exit()
 

@@ -139,7 +139,11 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
         return
     import difflib
 
-    commands = dict(_load_all(context.find_root()))
+    root, commands = context.find_root(), {}
+    group = root.command
+    for name in group.list_commands(root) if isinstance(group, click.Group) else ():
+        commands[name] = group.get_command(root, name)
+        commands |= {f"{name} {inner}": one for inner, one in getattr(commands[name], "commands", {}).items()}
     every = [option for one in commands.values() for option in _list_options(one).values()]
     known = {name.removeprefix(PREFIX) for option in every for name in option.envvar or ()}
     prefixes = tuple(f"{name.upper().replace(' ', '_')}_" for name in commands)
@@ -152,16 +156,6 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
         elif near or name.startswith(prefixes):
             meant = f"did you mean {PREFIX}{near[0]}?" if near else "see --help for the names"
             yield f"{PREFIX}{name} is ignored: no command has this option; {meant}"
-
-
-def _load_all(root: click.Context) -> Iterator[tuple[str, click.Command]]:
-    """All commands of the program: name, with that of its group, and command."""
-    group = root.command
-    for name in group.list_commands(root) if isinstance(group, click.Group) else ():
-        command = group.get_command(root, name)
-        yield name, command
-        for inner, one in getattr(command, "commands", {}).items():
-            yield f"{name} {inner}", one
 
 
 def _list_options(command: click.Command) -> dict[str, click.Option]:
@@ -452,20 +446,6 @@ LIBRARIES = ("numpy", "scipy", "laspy", "lazrs")
 """Libraries on which results and files depend."""
 
 
-def describe_version() -> str:
-    """Version of wavebatch, of Python and of the libraries; none of these is imported for it."""
-    import platform
-    from importlib import metadata
-
-    lines = [f"wavebatch {__version__}", f"Python {platform.python_version()}"]
-    for name in LIBRARIES:
-        try:
-            lines.append(f"{name} {metadata.version(name)}")
-        except metadata.PackageNotFoundError:
-            lines.append(f"{name} is not installed")
-    return "\n".join(lines)
-
-
 def write_man_pages(group: click.Group, folder: Path) -> list[Path]:
     """Write wavebatch.1 and a page per command into a folder, over older ones; returns their names."""
     from wavebatch.files.text_file import write_text
@@ -487,7 +467,13 @@ def _pages(command: click.Command, ctx: click.Context, title: str = "") -> Itera
     lines = [f'.TH "{name.upper()}" "1" "" "wavebatch {__version__}" "wavebatch"',
              ".SH NAME", f"{roff(name)} \\- {roff(_first_line(command.help))}",
              ".SH SYNOPSIS", *([usage] if title else [".B wavebatch", "COMMAND [OPTIONS] ..."]),
-             ".SH DESCRIPTION", *_describe(command.help or "")]  # fmt: skip
+             ".SH DESCRIPTION"]  # fmt: skip
+    for part in re.split(r"\n\s*\n", inspect.cleandoc(command.help or "").replace("\f", "")):
+        lines.append(".PP")
+        if part.startswith("\b"):  # click must not wrap it
+            lines += [".nf", *(roff(line) for line in part.lstrip("\b\n").splitlines()), ".fi"]
+        else:
+            lines.append(roff(" ".join(part.split())))
     if not title:
         lines.append(".SH COMMANDS")
         for one, its in inner.items():
@@ -505,16 +491,6 @@ def _pages(command: click.Command, ctx: click.Context, title: str = "") -> Itera
     yield name, "\n".join(lines) + "\n"
     for one, its in inner.items():
         yield from _pages(its, click.Context(its, info_name=one, parent=ctx), f"{title} {one}".strip())
-
-
-def _describe(text: str) -> Iterator[str]:
-    """Paragraphs; those that click must not wrap (\\b) keep their lines."""
-    for part in re.split(r"\n\s*\n", inspect.cleandoc(text).replace("\f", "")):
-        yield ".PP"
-        if part.startswith("\b"):
-            yield from (".nf", *(roff(line) for line in part.lstrip("\b\n").splitlines()), ".fi")
-        else:
-            yield roff(" ".join(part.split()))
 
 
 def _first_line(text: str | None) -> str:

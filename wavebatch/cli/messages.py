@@ -62,15 +62,10 @@ def close_log() -> None:
             handler.close()
 
 
-def log_is_open() -> bool:
-    """Whether a log is written."""
-    return any(isinstance(one, _LogFile) for one in _logger.handlers)
-
-
 def log_text(message: str, level: str | None = None) -> None:
     """A line with time and level; the level is found from the message if it is not given. Does nothing without a log.
     """
-    if log_is_open():
+    if any(isinstance(one, _LogFile) for one in _logger.handlers):
         level = level or next((name for name in LEVELS[:2] if f"{name}: " in message), "info")
         _logger.log(getattr(logging, level.upper()), "%s", message)
 
@@ -320,33 +315,30 @@ def one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
 
 
-def report_errors(failure: int = 1) -> Callable:
-    """Decorator of a command function: wavebatch's errors become one line on stderr and an exit code.
+def report_errors(function: Callable, failure: int = 1) -> Callable:
+    """A command function that makes of wavebatch's errors one line on stderr and an exit code.
 
     failure: exit code for files that cannot be read or written, and for bugs; a ConfigError gives EXIT_USAGE. The
     command's option `debug` prints the traceback too.
     """
 
-    def decorate(function: Callable) -> Callable:
-        @functools.wraps(function)
-        def guarded(*args: Any, **options: Any) -> Any:
-            try:
-                return function(*args, **options)
-            except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError) as error:
-                if isinstance(error, click.ClickException):
-                    log_text(printable(error.format_message()), "error")
-                raise
-            except Exception as error:
-                if interrupts.arrived():  # compiled code may have turned KeyboardInterrupt into this
-                    raise Interrupted("interrupted") from None
-                if options.get("debug"):
-                    traceback.print_exc()
-                talk(f"error: {one_line(error)}")
-                sys.exit(EXIT_USAGE if isinstance(error, ConfigError) else failure)
+    @functools.wraps(function)
+    def guarded(*args: Any, **options: Any) -> Any:
+        try:
+            return function(*args, **options)
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError) as error:
+            if isinstance(error, click.ClickException):
+                log_text(printable(error.format_message()), "error")
+            raise
+        except Exception as error:
+            if interrupts.arrived():  # compiled code may have turned KeyboardInterrupt into this
+                raise Interrupted("interrupted") from None
+            if options.get("debug"):
+                traceback.print_exc()
+            talk(f"error: {one_line(error)}")
+            sys.exit(EXIT_USAGE if isinstance(error, ConfigError) else failure)
 
-        return guarded
-
-    return decorate
+    return guarded
 
 
 def counting(unit: str, quiet: bool, total: int | None = None) -> Any:

@@ -329,7 +329,7 @@ def common_options(*names: str, failure: int = 1) -> Callable:
                     if len(same) > 1:
                         raise ConfigError(f"{same[0]}: two outputs have this name; choose another for one of them")
                 return command(*args, **options)
-        return together(*(_COMMON[name] for name in shared))(report_errors(failure)(call))
+        return together(*(_COMMON[name] for name in shared))(report_errors(call, failure))
 
     return decorate
 

@@ -354,7 +354,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.prepare import Positions, prepare
     from wavebatch.tools.api import find_request
-    from wavebatch.tools.plots.waveform import Wanted, add_ranges, find_places, format_echoes, name_chain, read_views
+    from wavebatch.tools.plots.waveform import Wanted, add_ranges, describe_step, find_places, format_echoes, read_views
 
     tabular = output.suffix.lower() == ".csv"
     for key, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
@@ -375,7 +375,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
             run, fill, error = add_ranges(choice.chain, reader, scan)
             system = system.with_radiometry(sensor_error=error)
         views = read_views(reader, scan, places, run, system, options["show"], fill)
-    name = name_chain(choice.chain)
+    detector, decomposer = map(describe_step, choice.chain.steps[1:3])
+    name = f"{choice.chain.name.removeprefix('profile ') or 'chain'}: {detector}, {decomposer}"
     if tabular:
         write_text(output, format_echoes(views), overwrite=options["overwrite"])
     else:

@@ -241,13 +241,17 @@ def run(**options: Any) -> None:
             click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
             start_early(wanted)
         with importing():
+            from wavebatch.batch.run import find_outputs
             from wavebatch.tools.api import plan_run
 
         jobs, batch_options = plan_run(options["strips"], shared.from_options(RunOptions, options), shared.note_input)
-        if options["report"] not in (None, "-"):
-            _check_report(Path(options["report"]), jobs, batch_options)
+        for option, target in (("--report", options["report"]), ("--html", options["html_file"])):
+            if target not in (None, "-"):  # it must not replace a file that is read or written by this run
+                refuse_input(Path(target))
+                outputs = {os.path.realpath(path) for job in jobs for path in find_outputs(job, batch_options.folder)}
+                if os.path.realpath(target) in outputs:
+                    raise ConfigError(f"{option}: {target} is an output of a strip; choose another name")
         if options["html_file"] is not None:
-            _check_report(options["html_file"], jobs, batch_options, "--html")
             shared.check_html(options["html_file"], will_exist=True)
         if options["dry_run"]:
             sys.exit(_dry_run(jobs, batch_options, options))
@@ -255,16 +259,6 @@ def run(**options: Any) -> None:
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
         raise messages.Interrupted(text) from None
-
-
-def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str = "--report") -> None:
-    """Raises ConfigError if the summary would replace a file that is read or written by this run."""
-    from wavebatch.batch.run import find_outputs
-
-    refuse_input(report)
-    outputs = {os.path.realpath(path) for job in jobs for path in find_outputs(job, batch_options.folder)}
-    if os.path.realpath(report) in outputs:
-        raise ConfigError(f"{option}: {report} is an output of a strip; choose another name")
 
 
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:

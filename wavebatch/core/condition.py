@@ -7,6 +7,7 @@ Before you change it: a point without data in a column meets no comparison with 
 
 from __future__ import annotations
 
+import functools
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -129,7 +130,7 @@ class _Parser:
 
     def read_all(self) -> tuple:
         """The whole text as a tree."""
-        tree = self._read_or()
+        tree = self._read_terms("or")
         if self._kind != "end":
             ends = self._value == ")"
             self._fail("the condition ends here, before" if ends else "`and`, `or` or the end is missing before")
@@ -155,18 +156,13 @@ class _Parser:
         what = "the end" if self._kind == "end" else repr(self._value)
         raise ConfigError(f"--where: character {self._place}: {reason} {what}")
 
-    def _read_or(self) -> tuple:
-        tree = self._read_and()
-        while (self._kind, self._value) == ("word", "or"):
+    def _read_terms(self, word: str) -> tuple:
+        """Terms with `word`, or or and, between them."""
+        read = functools.partial(self._read_terms, "and") if word == "or" else self._read_not
+        tree = read()
+        while (self._kind, self._value) == ("word", word):
             self._advance()
-            tree = ("or", tree, self._read_and())
-        return tree
-
-    def _read_and(self) -> tuple:
-        tree = self._read_not()
-        while (self._kind, self._value) == ("word", "and"):
-            self._advance()
-            tree = ("and", tree, self._read_not())
+            tree = (word, tree, read())
         return tree
 
     def _read_not(self) -> tuple:
@@ -177,7 +173,7 @@ class _Parser:
         if self._depth > MOST_NESTED:
             self._fail(f"more than {MOST_NESTED} parentheses or `not` inside each other at")
         self._advance()
-        tree = ("not", self._read_not()) if negated else self._read_or()
+        tree = ("not", self._read_not()) if negated else self._read_terms("or")
         if opened:
             if (self._kind, self._value) != ("sign", ")"):
                 self._fail("a closing parenthesis is missing before")
@@ -248,7 +244,17 @@ def _evaluate(tree: tuple, values: Mapping[str, np.ndarray], n: int) -> Truth:
         true, false = _evaluate(tree[1], values, n)
         return false, true
     if tree[0] not in ("and", "or"):
-        return _compare(tree, values, n)
+        sign, *names = tree
+        left, right = (
+            np.asarray(values[side] if isinstance(side, str) else side, np.float64) for side in names
+        )
+        if sign == "has":
+            known = ~np.isnan(left)
+            met = (np.where(known, left, 0).astype(np.int64) & int(right)) != 0
+            return known & met, known & ~met
+        known = np.broadcast_to(~(np.isnan(left) | np.isnan(right)), n)
+        met = np.broadcast_to(_COMPARISONS[sign](left, right), n)
+        return known & met, known & ~met
     word, parts = tree[0], []
     while tree[0] == word:
         parts.append(tree[2])
@@ -258,20 +264,6 @@ def _evaluate(tree: tuple, values: Mapping[str, np.ndarray], n: int) -> Truth:
         more, less = _evaluate(part, values, n)
         true, false = (true & more, false | less) if word == "and" else (true | more, false & less)
     return true, false
-
-
-def _compare(tree: tuple, values: Mapping[str, np.ndarray], n: int) -> Truth:
-    sign, *names = tree
-    left, right = (
-        np.asarray(values[side] if isinstance(side, str) else side, np.float64) for side in names
-    )
-    if sign == "has":
-        known = ~np.isnan(left)
-        met = (np.where(known, left, 0).astype(np.int64) & int(right)) != 0
-        return known & met, known & ~met
-    known = np.broadcast_to(~(np.isnan(left) | np.isnan(right)), n)
-    met = np.broadcast_to(_COMPARISONS[sign](left, right), n)
-    return known & met, known & ~met
 
 
 def read_flags(names: Sequence[str], option: str = "") -> int:

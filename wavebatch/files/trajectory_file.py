@@ -66,7 +66,21 @@ def read_trajectory(
     with reporting_reads(path, "trajectory "), open_regular(path) as file:
         size, head = path.stat().st_size, file.read(4096)
     if size and size % SBET_RECORD.itemsize == 0 and b"\0" in head:
-        columns = _read_sbet(path, size)
+        records = np.memmap(path, SBET_RECORD, "r")
+        step = max(1, -(-len(records) // MOST_RECORDS))
+        names = ("time", "latitude", "longitude", "height", *_ATTITUDE, "wander")
+        columns = {name: widen_integers(records[name][::step]) for name in names}
+        columns["z"], wander = columns.pop("height"), columns.pop("wander")
+        inside = (np.abs(columns["latitude"]) <= np.pi / 2) & (np.abs(columns["longitude"]) <= 2 * np.pi)
+        if not (inside & np.isfinite(columns["time"])).mean() > 0.99:
+            raise InputError(
+                f"{path}: not an SBET: its latitudes and longitudes are not radians; give text with headers"
+            )
+        with np.errstate(over="ignore", invalid="ignore"):  # a few damaged records: not finite, and not used later
+            # An SBET counts the heading in the wander frame, which is turned from north by the wander angle.
+            columns["heading"] -= wander
+            for name in ("latitude", "longitude"):
+                columns[name] = np.degrees(columns[name])
     elif b"\0" in head or not head.strip():
         raise InputError(f"{path}: trajectory is neither text nor SBET (records of {SBET_RECORD.itemsize} bytes)")
     else:
@@ -96,23 +110,6 @@ def read_trajectory(
         xyz = apply_lever_arm(xyz, np.stack([columns[name] for name in _ATTITUDE], axis=1), lever_arm)
     with naming(path):
         return Trajectory.build(columns["time"], xyz)
-
-
-def _read_sbet(path: Path, size: int) -> dict[str, np.ndarray]:
-    records = np.memmap(path, SBET_RECORD, "r")
-    step = max(1, -(-len(records) // MOST_RECORDS))
-    names = ("time", "latitude", "longitude", "height", *_ATTITUDE, "wander")
-    columns = {name: widen_integers(records[name][::step]) for name in names}
-    columns["z"], wander = columns.pop("height"), columns.pop("wander")
-    inside = (np.abs(columns["latitude"]) <= np.pi / 2) & (np.abs(columns["longitude"]) <= 2 * np.pi)
-    if not (inside & np.isfinite(columns["time"])).mean() > 0.99:
-        raise InputError(f"{path}: not an SBET: its latitudes and longitudes are not radians; give text with headers")
-    with np.errstate(over="ignore", invalid="ignore"):  # a few damaged records: not finite, and not used later
-        # An SBET counts the heading in the wander frame, which is turned from north by the wander angle.
-        columns["heading"] -= wander
-        for name in ("latitude", "longitude"):
-            columns[name] = np.degrees(columns[name])
-    return columns
 
 
 def _read_text(path: Path, size: int) -> dict[str, np.ndarray]:

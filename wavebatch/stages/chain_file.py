@@ -17,7 +17,7 @@ from typing import Any
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, check_range, check_type, format_toml, format_toml_value, parse_toml
-from wavebatch.stages.chain import KINDS, STAGES, Chain, Stage, Step
+from wavebatch.stages.chain import KINDS, STAGES, Chain, Step
 
 GROUP = "wavebatch.stages"
 
@@ -44,38 +44,6 @@ def load_plugins() -> tuple[str, ...]:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             failures.append(f"plugin {point.name} ({point.value}) cannot be imported: {reason}")
     return tuple(failures)
-
-
-def find_stage(name: str, where: str) -> Stage:
-    """Look up a stage; plugins are imported when no built-in stage has the name.
-
-    Parameters
-    ----------
-    name : str
-        `kind.function`.
-    where : str
-        Start of the error message: file and table.
-
-    Returns
-    -------
-    Stage
-        The registered stage.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown name, with the nearest known one and the plugins that cannot be imported.
-    """
-    if name not in STAGES:
-        failures = load_plugins()
-        if name not in STAGES:
-            kind = f"{name.partition('.')[0]}."
-            same = [known for known in STAGES if known.startswith(kind)]
-            advice = nearest(name, same or STAGES)
-            if not same and advice.startswith("known"):
-                advice = f"names begin with {', '.join(f'{one}.' for one in KINDS)}; `wavebatch stages` lists them"
-            raise ConfigError("; ".join([f"{where}: unknown stage {name!r}", advice, *failures]))
-    return STAGES[name]
 
 
 _SHIPPED = Path(__file__).with_name("profiles")
@@ -196,7 +164,16 @@ def format_step(stage: str, parameters: Mapping[str, Any]) -> str:
 def _read_step(table: TomlTable) -> Step:
     table.check_keys(table.values, ["stage"], 'name one, for example stage = "detect.maximum"')
     name = table.get("stage", str)
-    stage, where = find_stage(name, table.where), f"{table.where} ({name})"
+    if name not in STAGES:
+        failures = load_plugins()
+        if name not in STAGES:
+            kind = f"{name.partition('.')[0]}."
+            same = [known for known in STAGES if known.startswith(kind)]
+            advice = nearest(name, same or STAGES)
+            if not same and advice.startswith("known"):
+                advice = f"names begin with {', '.join(f'{one}.' for one in KINDS)}; `wavebatch stages` lists them"
+            raise ConfigError("; ".join([f"{table.where}: unknown stage {name!r}", advice, *failures]))
+    stage, where = STAGES[name], f"{table.where} ({name})"
     TomlTable(table.values, where).check_keys(["stage", *stage.parameters])
     values = {}
     for key in table.values:

@@ -24,7 +24,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     PulseMeasures,
     PulseShape,
     evaluate_pulse,
-    find_datum,
+    matched_gaussian,
     measure_pulse,
 )
 from wavebatch.kernels.signal.filters import refine_peaks
@@ -98,23 +98,6 @@ def floor_level(system: SystemPulse) -> float:
     return 0.0 if noise.baseline > FAR_FROM_FLOOR * np.hypot(noise.quiet, noise.baseline_spread) else -np.inf
 
 
-def noise_filter(system: SystemPulse) -> np.ndarray | None:
-    """Return the filter that makes the strip's noise white, with `noise.std`.
-
-    Parameters
-    ----------
-    system : SystemPulse
-        Result of the survey.
-
-    Returns
-    -------
-    float64 (3, 3) or None
-        As `whitening_filter`; None where fits take the noise for white.
-    """
-    noise = system.noise
-    return whitening_filter(noise.whitening, noise.std / noise.quiet) if noise.whitening else None
-
-
 def fit_misfit(system: SystemPulse, spacing: float) -> float:
     """Return the misfit of the pulse as fits see it: whitened, it grows with the third and fourth Hermite directions.
 
@@ -186,44 +169,6 @@ def shape_limits(
     return ShapeLimits(ref, max(least * ref, positive), max(most * ref, positive))
 
 
-@lru_cache(maxsize=16)
-def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
-    """Tabulate peak and full width at half maximum by fitted width; cached, since each block needs it.
-
-    Parameters
-    ----------
-    shape : PulseShape
-        A pulse.
-    limits : ShapeLimits
-        Range of the table.
-
-    Returns
-    -------
-    PulseMeasures
-        The table.
-    """
-    return measure_pulse(shape, limits.low, limits.high)
-
-
-@lru_cache(maxsize=16)
-def matched_gaussian(shape: PulseShape, width: float) -> tuple[float, float]:
-    """Return the Gaussian that fits a pulse best: cached, since each block needs it.
-
-    Parameters
-    ----------
-    shape : PulseShape
-        A pulse.
-    width : float
-        Its width [samples].
-
-    Returns
-    -------
-    centre, sigma : float
-        Centre after that of the pulse's main part, and standard deviation [samples].
-    """
-    return find_datum(shape, width)
-
-
 def _find_delay(shape: PulseShape, ref: float, width: np.ndarray) -> tuple[np.ndarray | float, np.ndarray | float]:
     """Datum after the fitted time, and its slope by the width, of echoes of these widths (m,) [samples].
 
@@ -248,19 +193,12 @@ def _is_symmetric(shape: PulseShape) -> bool:
     return not shape.components and shape.table is None and abs(shape.kappa) < NO_SKEW
 
 
-def _near_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
-    """The table of the usual widths."""
-    return pulse_measures(shape, limits._replace(high=min(limits.high, _usual(limits))))
-
-
-def _wide_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
-    """The table of all widths above: one of both would be too coarse for the usual ones."""
-    usual = _usual(limits)
-    return pulse_measures(shape, ShapeLimits(limits.ref, usual, max(BROADEST * limits.ref, 1.01 * usual)))
-
-
-def _usual(limits: ShapeLimits) -> float:
-    return max(MOST_WIDTH * limits.ref, 1.01 * limits.low)
+def _table(shape: PulseShape, limits: ShapeLimits, *, wide: bool = False) -> PulseMeasures:
+    """The table of the usual widths, or of all widths above: one of both would be too coarse for the usual ones."""
+    usual = max(MOST_WIDTH * limits.ref, 1.01 * limits.low)
+    if wide:
+        return measure_pulse(shape, usual, max(BROADEST * limits.ref, 1.01 * usual))
+    return measure_pulse(shape, limits.low, min(limits.high, usual))
 
 
 @lru_cache(maxsize=16)
@@ -363,7 +301,7 @@ def _factors_at(
     whole[1] += _find_delay(shape, limits.ref, np.full(1, width))[1] * main[2]
     if shape.components:
         # The peak of a pulse of amplitude 1, and its slope by the width.
-        measures = pulse_measures(shape, limits)
+        measures = measure_pulse(shape, limits.low, limits.high)
         slopes = np.gradient(measures.peak, measures.width)
         peak, by_peak = (np.interp(np.array(width), measures.width, values) for values in (measures.peak, slopes))
         whole[0] += by_peak / peak * width * main[2]
@@ -421,8 +359,8 @@ def whole_pulse(shape: PulseShape, limits: ShapeLimits, widths: np.ndarray) -> W
         return WholePulse()
     if not shape.components:
         return WholePulse(STRETCHED, datum=_unit_datum(shape), ref=limits.ref, least=LEAST_WIDTH)
-    near = _near_table(shape, limits)
-    wide = _rows(_wide_table(shape, limits)) if (widths > near.width[-1]).any() else NO_ROWS
+    near = _table(shape, limits)
+    wide = _rows(_table(shape, limits, wide=True)) if (widths > near.width[-1]).any() else NO_ROWS
     return WholePulse(SUMMED, _rows(near), wide, datum=matched_gaussian(shape, limits.ref)[0])
 
 
@@ -454,11 +392,11 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
         return echoes
     inner = echoes.copy()
     if shape.components:
-        near = _near_table(shape, limits)
+        near = _table(shape, limits)
         inner = _invert(near, echoes)
         beyond = echoes[:, 2] * FWHM_PER_SIGMA > near.half_width[-1] * (1 + 1e-5)
         if limits.high > near.width[-1] and beyond.any():
-            inner[beyond] = _invert(_wide_table(shape, limits), echoes[beyond])
+            inner[beyond] = _invert(_table(shape, limits, wide=True), echoes[beyond])
     inner[:, 1] -= _find_delay(shape, limits.ref, inner[:, 2])[0]
     return inner
 

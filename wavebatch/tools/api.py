@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec
 
-from wavebatch.batch.job import StripJob, choose_columns, list_column_names
+from wavebatch.batch.job import StripJob, choose_columns, split_columns
 from wavebatch.batch.options import RunOptions, describe_options
 from wavebatch.batch.run import BatchResult, check_outputs, plan_memory, run_batch
 from wavebatch.core.errors import ConfigError, InputError, nearest
@@ -348,7 +348,7 @@ def plan_run(
         Path(),
         widest_chain,
         options,
-        list_column_names(options.columns),
+        tuple(entry.removeprefix("+") for entry in split_columns(options.columns) if entry.strip(" +")),
         request,
         read_sensor(options),
         None if options.calibration is None else load_calibration(Path(options.calibration)),

@@ -21,7 +21,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
-from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader, check_alike
+from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.raw_bytes import undoing
 from wavebatch.files.disk.temp_store import Spool
@@ -85,13 +85,21 @@ class Clouds:
 
     def __init__(self, paths: Sequence[Path], columns: Sequence[str | None], chosen: PointFilter = EVERY) -> None:
         self.paths, self._columns, self.chosen = tuple(paths), tuple(columns), chosen
-        found: list[list[tuple[Path, ColumnFacts]]] = []
+        found: list[Sequence[ColumnFacts]] = []
         for path in self.paths:
             with self._open(path) as reader:
-                found.append([(path, facts) for facts in reader.facts])
+                found.append(reader.facts)
         every = []
         for column in zip(*found, strict=True):
-            facts = check_alike(column)
+            first = column[0]
+            for path, facts in zip(self.paths, column, strict=True):
+                if (facts.unit, facts.is_flags) != (first.unit, first.is_flags):
+                    raise ConfigError(
+                        f"{path}: {facts.name} is in [{facts.unit}], {first.name} of {self.paths[0]} in "
+                        f"[{first.unit}]; plot them one by one"
+                    )
+            # The shortest name: one cloud may have `wb_amplitude` beside an `amplitude` of its strip.
+            facts = replace(first, name=min((one.name for one in column), key=len))
             if facts.is_standard and facts.name in ("x", "y", "z"):  # a coordinate has the unit of the CRS
                 words = describe_crs(self.paths[0])
                 facts = replace(facts, unit=words.upright_unit if facts.name == "z" else words.unit)

@@ -147,16 +147,6 @@ class Forest:
         self.reasons = np.zeros(3, np.int64)
         """Cells by KNOWN, FEW_RAYS, NO_GROUND."""
 
-    def list_bands(self, highest: float) -> list[Band]:
-        """Names and units of the bands, for voxels up to a height [m]."""
-        step = self.options.layer
-        self.layers = max(int(np.ceil(min(highest + 0.5 * self.size, TALLEST) / step)), 1)
-        bands = [Band("cover", ""), Band("cover_err", ""), *(Band(f"light_height_{part}", "m") for part in QUANTILES)]
-        bands += [Band("leaf_area_index", ""), Band("leaf_area_index_err", "")]
-        for name in ("leaf_area_density", "leaf_area_density_err"):
-            bands += [Band(f"{name} {i * step:g}-{(i + 1) * step:g} m", "1/m") for i in range(self.layers)]
-        return [*bands, Band("no_data_reason", "")]
-
     def compute(self, cell: np.ndarray, values: np.ndarray, number: int) -> np.ndarray:
         """Bands f8 (m, number) from the cell of each voxel i8 (n,) and its COLUMNS f8 (n, 10); NaN without voxels."""
         height = values[:, 2]
@@ -420,7 +410,15 @@ def write_grid(
         units = {"count": "", "density": f"1/{unit}2"}
         bands = [Band(f"{statistic} of {one.name}", units.get(statistic, one.unit.strip("-"))) for one in clouds.every]
     else:
-        bands, statistic = metrics.list_bands(largest[COLUMNS.index("height")]), metrics.compute
+        step = metrics.options.layer
+        top = min(largest[COLUMNS.index("height")] + 0.5 * metrics.size, TALLEST)
+        metrics.layers = max(int(np.ceil(top / step)), 1)
+        bands = [Band("cover", ""), Band("cover_err", ""), *(Band(f"light_height_{part}", "m") for part in QUANTILES)]
+        bands += [Band("leaf_area_index", ""), Band("leaf_area_index_err", "")]
+        for name in ("leaf_area_density", "leaf_area_density_err"):
+            bands += [Band(f"{name} {i * step:g}-{(i + 1) * step:g} m", "1/m") for i in range(metrics.layers)]
+        bands.append(Band("no_data_reason", ""))
+        statistic = metrics.compute
     result = GridResult(layout=layout, bands=tuple(bands), unnamed=tuple(unnamed))
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}"}
     if metrics is None:

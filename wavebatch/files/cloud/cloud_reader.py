@@ -11,7 +11,6 @@ import contextlib
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy as np
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
-from wavebatch.files.cloud.column_names import STYLES, find_written, name_standard, read_field, resolve
+from wavebatch.files.cloud.column_names import STYLES, name_standard, read_field, read_provenance, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.disk.raw_bytes import Closing, undoing, widen_integers
 from wavebatch.files.las import header as las
@@ -128,11 +127,13 @@ class CloudReader(Closing):
         self.extra = {field: record for field, record in checked.extra.items() if not record.dtype.shape}
         """The record of each extra dimension that is one number, by its field."""
         self._point_length = checked.dtype.itemsize
-        written = find_written(checked.header, self.extra)
-        self.written = {column: name for column, name in written.items()
-                        if column != "echo_flags" or self.extra[name].dtype.kind == "u"}  # fmt: skip
-        """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
-        program has stored as several numbers, or flags as signed ones, are none."""
+        runs = read_provenance(checked.header)
+        written = runs[-1].get("columns") if runs else None
+        self.written = {column: name for column, name in (written if isinstance(written, dict) else {}).items()
+                        if isinstance(name, str) and name in self.extra
+                        and (column != "echo_flags" or self.extra[name].dtype.kind == "u")}  # fmt: skip
+        """The file's name of each wavebatch column, by the provenance of the latest run; empty without one. Columns
+        that another program has renamed, left out or stored as several numbers, or flags as signed ones, are none."""
         self._sources = self._find_ours((*las.field_names(dtype), "echo_flags"))
         self.columns = tuple(name for name in las.field_names(dtype) if name in self._sources)
         """The wavebatch columns among the fields that the cloud has."""
@@ -317,22 +318,6 @@ class ColumnReader(CloudReader):
         for place, read in enumerate(self._values):
             rows["values"][:, place] = read(raw)
         return rows
-
-
-def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:
-    """Return the facts of a column that several clouds have; raises ConfigError if their units differ.
-
-    Its name is the shortest: one cloud may have `wb_amplitude` beside an `amplitude` of its strip.
-    """
-    readers = list(readers)
-    first_path, first = readers[0]
-    for path, facts in readers[1:]:
-        if (facts.unit, facts.is_flags) != (first.unit, first.is_flags):
-            raise ConfigError(
-                f"{path}: {facts.name} is in [{facts.unit}], {first.name} of {first_path} in [{first.unit}]; plot them "
-                "one by one"
-            )
-    return replace(first, name=min((facts.name for _, facts in readers), key=len))
 
 
 def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.ndarray:

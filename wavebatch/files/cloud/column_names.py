@@ -41,19 +41,6 @@ def read_provenance(header: las.LasHeader) -> list[dict[str, Any]]:
     return runs
 
 
-def find_written(header: las.LasHeader, extra: Collection[str]) -> dict[str, str]:
-    """Return the file's name of each wavebatch column, by the latest run.
-
-    extra: names of the extra dimensions of the file. Another program may have renamed or left out some since then; if
-    none of the columns is left the provenance does not describe this file, and the result is empty.
-    """
-    runs = read_provenance(header)
-    columns = runs[-1].get("columns") if runs else None
-    if not isinstance(columns, dict):
-        return {}
-    return {column: name for column, name in columns.items() if isinstance(name, str) and name in extra}
-
-
 @frozen
 class Naming:
     """How a style writes one column, where it differs from the declaration of the column."""

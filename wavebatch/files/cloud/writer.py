@@ -65,6 +65,11 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
         raise ConfigError(f"las_version {wanted!r}: must be one of {', '.join(LAS_VERSIONS)}")
     target = las.choose_format(path, header, point_format, keep)
     evlrs, _ = las.find_evlrs(path, header)
+    pairs = zip(header.vlrs, repair_records(header.vlrs), strict=True)
+    repaired = next((new.payload.rstrip(b"\0").decode() for old, new in pairs if new is not old), None)
+    # The writer of the cloud repairs extended records as it copies them; the line is for them too.
+    wrong = repaired is not None or any(repair_evlr(path, evlr) is not None for evlr in evlrs)
+    notes = (_REPAIRED,) * wrong
     if wanted == "1.3":  # if it can hold all that the strip has
         if target >= 6:
             needed = header.point_format >= 6
@@ -75,11 +80,9 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
             raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
         if _tell_crs(header.vlrs) == (True, False):
             raise InputError(f"{path}: its CRS is given as WKT, which LAS 1.3 does not have; leave --las-version out")
-        repaired, notes = _repair(path, header)
         return Version((1, 3), target, repaired, notes)
     records: list[Any] = [*header.vlrs, *evlrs]
     only_keys = _tell_crs(records) == (False, True)
-    repaired, notes = _repair(path, header, evlrs)
     if wanted == "1.4" and point_format is None and not keep:
         modern = las.MODERN.get(target, target)
         wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
@@ -104,17 +107,6 @@ _REPAIRED = (
     "the strip's WKT says metres where it means degrees, as RiPROCESS writes it: GIS programs show the strip "
     "in a wrong place; the cloud's WKT is right"
 )
-
-
-def _repair(path: Path, header: las.LasHeader, evlrs: Sequence[las.Evlr] = ()) -> tuple[str | None, tuple[str, ...]]:
-    """The repaired WKT of the header, None where it is right or not there, and the line for the user.
-
-    The writer of the cloud repairs extended records as it copies them; the line is for them too.
-    """
-    pairs = zip(header.vlrs, repair_records(header.vlrs), strict=True)
-    wkt = next((new.payload.rstrip(b"\0").decode() for old, new in pairs if new is not old), None)
-    wrong = wkt is not None or any(repair_evlr(path, evlr) is not None for evlr in evlrs)
-    return wkt, (_REPAIRED,) * wrong
 
 
 def _tell_crs(records: Sequence[Any]) -> tuple[bool, bool]:

@@ -110,13 +110,14 @@ class GeoKeys:
         """
         horizontal, vertical = self._read_unit(_LINEAR), self._read_unit(_VERTICAL)
         if horizontal is None and self.kind != "geographic":
-            horizontal, words = find_unit(self._find_code(_PROJECTED_CODE)), self.texts.decode("latin-1").lower()
+            horizontal = _units(False).get(self._find_code(_PROJECTED_CODE))
+            words = self.texts.decode("latin-1").lower()
             if horizontal is None and any(part in words for part in ("ftus", "us survey f", "us_survey_f", "us feet")):
                 horizontal = 1200 / 3937
             elif horizontal is None and re.search(r"\b(feet|foot|ft)\b", words):
                 horizontal = 0.3048
         if vertical is None:
-            vertical = find_unit(self._find_code(_VERTICAL_CODE), vertical=True)
+            vertical = _units(True).get(self._find_code(_VERTICAL_CODE))
         return horizontal, vertical
 
     def _find_code(self, key: int) -> int:
@@ -186,13 +187,9 @@ _VERTICAL_UNITS = {
 """The same of vertical CRSs."""
 
 
-def find_unit(code: int, *, vertical: bool = False) -> float | None:
-    """Metres per unit of a CRS by its EPSG code; None for metres and for codes that are not known."""
-    return _units(vertical).get(code)
-
-
 @functools.cache
 def _units(vertical: bool) -> dict[int, float]:
+    """Metres per unit of a CRS by its EPSG code; those in metres are not among them."""
     table = _VERTICAL_UNITS if vertical else _PROJECTED_UNITS
     found: dict[int, float] = {}
     for unit, codes in table.items():

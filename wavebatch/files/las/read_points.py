@@ -10,6 +10,7 @@ checked before it gets any bytes, and each chunk is passed on as a small file in
 
 from __future__ import annotations
 
+import itertools
 import struct
 from io import BytesIO
 from pathlib import Path
@@ -217,13 +218,11 @@ class LazPoints:
             small.seek(0)
             self._decoder = lazrs.LasZipDecompressor(small, self._coding.payload)
             self._chunk, self._next = chunk, int(self._first[chunk])
-        while self._next < start:
-            self._decode(np.empty(min(_PIECE, start - self._next), self._checked.dtype))
-        self._decode(rows)
-
-    def _decode(self, rows: np.ndarray) -> None:
-        self._decoder.decompress_many(rows.view(np.uint8).reshape(-1))
-        self._next += len(rows)
+        places = range(self._next, start, _PIECE)
+        before = (np.empty(min(_PIECE, start - place), self._checked.dtype) for place in places)
+        for part in itertools.chain(before, [rows]):
+            self._decoder.decompress_many(part.view(np.uint8).reshape(-1))
+            self._next += len(part)
 
     def _read_chunk(self, chunk: int) -> BytesIO:
         """This chunk as a small LAZ file in memory, so that lazrs cannot read beyond it."""

@@ -20,7 +20,7 @@ decided by the scan once per descriptor, from packets spread over the strip, bec
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from enum import IntEnum
 
@@ -168,7 +168,10 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
         odd = f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
         warnings.append(odd)
     (toward, away), (up, down) = tally.pairs, tally.heights
-    pairs, heights = _verdict(toward, away, _MOSTLY), _verdict(up, down, _CLEAR)
+    pairs, heights = (
+        "toward" if 0 < share * (one + other) <= one else "away" if 0 < share * (one + other) <= other else ""
+        for one, other, share in ((toward, away, _MOSTLY), (up, down, _CLEAR))
+    )
     evidence = f"{toward} of {toward + away} pairs that share a packet and {up} of {up + down} heights say toward"
     if toward + away < _ENOUGH and heights:
         pairs = ""
@@ -182,13 +185,6 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
             warnings.append(f"--direction {option} overrides the evidence of the file: {evidence}")
         chosen, problems, evidence = option, [], f"given; {evidence}"
     return VectorDecision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
-
-
-def _verdict(toward: int, away: int, share: float) -> str:
-    total = toward + away
-    if total and toward >= share * total:
-        return "toward"
-    return "away" if total and away >= share * total else ""
 
 
 _WAVEFORMS, _SAMPLES = 1024, 1 << 20
@@ -273,22 +269,20 @@ def compare_returns(blocks: Iterable[tuple[WaveformBlock, np.ndarray]]) -> np.nd
         strongest = order[np.unique(returns.waveform[order], return_index=True)[1]]
         part = block.samples, returns.time[strongest] / block.spacing, strength[strongest]
         groups.setdefault(block.digitizer.index, []).append(part)
-    return np.concatenate([np.empty((0, 7)), *(part for group in groups.values() for part in _compare(group))])
-
-
-def _compare(group: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Iterator[np.ndarray]:
-    """Tables of the blocks of one digitizer: samples (n, s), place (n,) and intensity (n,) of the strongest returns."""
-    places = np.concatenate([place for _, place, _ in group])
-    sets = [places, *(np.roll(places, int(share * len(places))) for share in _SHIFTS)]
-    first = 0
-    for samples, place, strength in group:
-        last = first + len(samples)
-        height, level = samples.max(axis=1).astype(float), median(samples, axis=1)
-        height -= level
-        found = np.stack([_read_height(samples, at[first:last]) - level for at in sets]) / np.maximum(height, 1.0)
-        table = [height, samples.argmax(axis=1), place, strength, found[0], found[1:].mean(axis=0)]
-        yield np.column_stack([*table, level - samples.min(axis=1)])[height > 0]
-        first = last
+    tables = [np.empty((0, 7))]
+    for group in groups.values():
+        places = np.concatenate([place for _, place, _ in group])
+        sets = [places, *(np.roll(places, int(share * len(places))) for share in _SHIFTS)]
+        first = 0
+        for samples, place, strength in group:
+            last = first + len(samples)
+            height, level = samples.max(axis=1).astype(float), median(samples, axis=1)
+            height -= level
+            found = np.stack([_read_height(samples, at[first:last]) - level for at in sets]) / np.maximum(height, 1.0)
+            table = [height, samples.argmax(axis=1), place, strength, found[0], found[1:].mean(axis=0)]
+            tables.append(np.column_stack([*table, level - samples.min(axis=1)])[height > 0])
+            first = last
+    return np.concatenate(tables)
 
 
 def _read_height(samples: np.ndarray, place: np.ndarray) -> np.ndarray:

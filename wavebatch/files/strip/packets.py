@@ -357,11 +357,6 @@ def _find_runs(ordered: np.ndarray, width: int, gap: int, most: int = 2**62) -> 
     return zip(edges[:-1], edges[1:], strict=True)
 
 
-def block_rows(size: int, n_samples: int, bits: int) -> int:
-    """Return the waveforms per block: `size`, or fewer if their samples take more than BLOCK_BYTES."""
-    return max(1, min(size, BLOCK_BYTES // (n_samples * (bits // 8))))
-
-
 _FORMATS = {(1, 3): (4, 5), (1, 4): (4, 5, 9, 10), (1, 5): (9, 10)}
 
 

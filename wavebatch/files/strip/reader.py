@@ -25,7 +25,7 @@ from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_
 from wavebatch.files.las.header import locate, read_scanner
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check, scanner
-from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
+from wavebatch.files.strip.packets import BLOCK_BYTES, PacketFile, StripFacts, find_facts
 from wavebatch.files.strip.scanner import SCAN_SIZES, Scanner, ScanPart, ScanSizes, StripScan
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
 
@@ -352,7 +352,7 @@ class StripReader(Closing):
             packed, n_samples = bool(table.packed[same[0]]), int(table.n_samples[same[0]])
             form = unit.forms.get(stored.index, packet_check.PLAIN)
             digitizer = form.digitizer(stored, packed)
-            step = block_rows(size, n_samples, 8 * digitizer.width)
+            step = max(1, min(size, BLOCK_BYTES // (n_samples * digitizer.width)))
             for begin in range(0, len(same), step):
                 chosen = same[begin : begin + step]
                 places = table.offset[chosen]

@@ -249,7 +249,22 @@ def _as_problem(
         *(place(field, np.float64) for field in (candidates.amplitude, candidates.time, candidates.width)),
     )  # fmt: skip
     windows.arrays = candidates, clusters
-    return samples.as_block(), windows, _as_structure(settings)
+    if not 0 < settings.width_ref < np.inf:
+        raise ValueError("the width of the pulse must be above 0")
+    pulse = as_pulse(settings.shape)
+    values = settings._asdict() | {
+        "pulse": pulse,
+        "clip": np.inf if settings.clip is None else settings.clip,
+        "floor": -np.inf if settings.floor is None else settings.floor,
+    }
+    del values["shape"]
+    table = np.zeros((3, 3)) if settings.whitening is None else np.asarray(settings.whitening, np.float64)
+    if table.shape != (3, 3) or not np.isfinite(table).all():
+        raise ValueError("a whitening filter has three finite rows of three")
+    values |= {"whitened": settings.whitening is not None, "whitening": (ctypes.c_double * 9)(*table.ravel())}
+    structure = library.CSettings(**values)
+    structure.arrays = pulse.arrays
+    return samples.as_block(), windows, structure
 
 
 def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tuple[Candidates, Clusters]:
@@ -268,26 +283,6 @@ def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tupl
         Candidates(*(np.ascontiguousarray(field, np.float64) for field in candidates)),
         Clusters(*(np.ascontiguousarray(field, np.int64) for field in clusters)),
     )
-
-
-def _as_structure(settings: Settings) -> library.CSettings:
-    """The settings for the library."""
-    if not 0 < settings.width_ref < np.inf:
-        raise ValueError("the width of the pulse must be above 0")
-    pulse = as_pulse(settings.shape)
-    values = settings._asdict() | {
-        "pulse": pulse,
-        "clip": np.inf if settings.clip is None else settings.clip,
-        "floor": -np.inf if settings.floor is None else settings.floor,
-    }
-    del values["shape"]
-    table = np.zeros((3, 3)) if settings.whitening is None else np.asarray(settings.whitening, np.float64)
-    if table.shape != (3, 3) or not np.isfinite(table).all():
-        raise ValueError("a whitening filter has three finite rows of three")
-    values |= {"whitened": settings.whitening is not None, "whitening": (ctypes.c_double * 9)(*table.ravel())}
-    structure = library.CSettings(**values)
-    structure.arrays = pulse.arrays
-    return structure
 
 
 def as_pulse(shape: PulseShape) -> library.Pulse:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -226,8 +227,9 @@ class PulseMeasures(NamedTuple):
     """Full width at half maximum of the main lobe [samples], ascending."""
 
 
+@lru_cache(maxsize=16)
 def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
-    """Peak and full width at half maximum of a sum of Gaussians, over a range of widths.
+    """Peak and full width at half maximum of a sum of Gaussians, over a range of widths; cached for the next block.
 
     Parameters
     ----------
@@ -288,8 +290,22 @@ def fit_one_gaussian(x: np.ndarray, value: np.ndarray) -> tuple[float, float]:
     return float(centre), float(sigma)
 
 
-def find_datum(shape: PulseShape, width: float) -> tuple[float, float]:
-    """Centre and standard deviation of the Gaussian that fits a pulse of this width best [samples]."""
+@lru_cache(maxsize=16)
+def matched_gaussian(shape: PulseShape, width: float) -> tuple[float, float]:
+    """Return the Gaussian that fits a pulse best: cached, since each block needs it.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        A pulse.
+    width : float
+        Its width [samples].
+
+    Returns
+    -------
+    centre, sigma : float
+        Centre after that of the pulse's main part, and standard deviation [samples].
+    """
     reach = max([8 * width, *(abs(delay) + 4 * width for _, delay, _ in shape.components)])
     x = np.arange(-reach, reach, width / 32)
     return fit_one_gaussian(x, evaluate_pulse(shape, x, np.zeros(1), np.full(1, width))[0])

@@ -59,24 +59,12 @@ def render_echoes(
             near: slice | np.ndarray = slice(None)
             if s > COLUMNS:
                 near = np.flatnonzero((t > first - reach) & (t < first + COLUMNS + reach))
-            _add(signal[:, columns], shape, x[columns], owner[near], t[near], w[near], height[near])
+            row = owner[near]
+            if len(row):
+                starts = np.flatnonzero(np.r_[True, np.diff(row) != 0])
+                pulse = evaluate_pulse(shape, x[columns], t[near][:, None], w[near][:, None])[0] * height[near][:, None]
+                signal[:, columns][row[starts]] += np.add.reduceat(pulse, starts, axis=0)
     return signal
-
-
-def _add(
-    signal: np.ndarray,
-    shape: PulseShape,
-    x: np.ndarray,
-    owner: np.ndarray,
-    time: np.ndarray,
-    width: np.ndarray,
-    height: np.ndarray,
-) -> None:
-    """Adds the pulses (m,) to the rows `owner` of the signal (n, k) at the samples x (k,)."""
-    if len(owner):
-        starts = np.flatnonzero(np.r_[True, np.diff(owner) != 0])
-        pulse = evaluate_pulse(shape, x, time[:, None], width[:, None])[0] * height[:, None]
-        signal[owner[starts]] += np.add.reduceat(pulse, starts, axis=0)
 
 
 def _reach(shape: PulseShape, width: np.ndarray) -> np.ndarray:

@@ -244,7 +244,14 @@ def find_lines(
         if found is None:
             failures += 1
         else:
-            lines.append(_describe(found, centre, weight))
+            middle = found.middle + centre
+            normal = _across(found.along)
+            theta = np.degrees(np.arctan2(normal[1], normal[0]))
+            if not -90 <= theta < 90:
+                normal, theta = -normal, (theta + 270) % 180 - 90
+            start, end = (tuple((middle + place * found.along).tolist()) for place in found.ends)
+            light = float(weight[found.rows].sum())
+            lines.append(HoughLine(float(theta), float(middle @ normal), start, end, light, found.rows))
         if not len(used):
             break
         left[used] = False
@@ -399,13 +406,3 @@ def _longest_run(rows: np.ndarray, place: np.ndarray, gap: float) -> tuple[np.nd
     best = int(np.argmax(sorted_[last] - sorted_[first]))
     a, b = int(first[best]), int(last[best])
     return np.sort(rows[order[a : b + 1]]), (float(sorted_[a]), float(sorted_[b]))
-
-
-def _describe(run: _Run, centre: np.ndarray, weight: np.ndarray) -> HoughLine:
-    middle = run.middle + centre
-    normal = _across(run.along)
-    theta = np.degrees(np.arctan2(normal[1], normal[0]))
-    if not -90 <= theta < 90:
-        normal, theta = -normal, (theta + 270) % 180 - 90
-    start, end = (tuple((middle + place * run.along).tolist()) for place in run.ends)
-    return HoughLine(float(theta), float(middle @ normal), start, end, float(weight[run.rows].sum()), run.rows)

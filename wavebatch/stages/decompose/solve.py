@@ -24,8 +24,9 @@ from wavebatch.kernels.fit.decompose import (
     decompose_clusters,
     keep_echoes,
 )
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, matched_gaussian, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.library import Samples
+from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
@@ -39,9 +40,7 @@ from wavebatch.stages.pulse_tables import (
     clip_level,
     error_factors,
     floor_level,
-    matched_gaussian,
     model_parameters,
-    noise_filter,
     pulse_shape,
     shape_limits,
     whole_pulse,
@@ -249,9 +248,12 @@ def make_settings(
     pulse = system if shape.components else replace(system, components=())
     limits = shape_limits(pulse, block.spacing, fit.least_width, fit.most_width)
     floor = floor_level(system) if shape.components else None  # no other pulse goes below its level
+    noise = system.noise
+    # It makes the noise white, with `noise.std`.
+    whitening = whitening_filter(noise.whitening, noise.std / noise.quiet) if noise.whitening else None
     return Settings(
-        *limits, shape=shape, clip=clip_level(block, system), floor=floor, noise_gain=system.noise.gain,
-        tolerance=fit.tolerance, max_iterations=fit.max_iterations, whitening=noise_filter(system), **options,
+        *limits, shape=shape, clip=clip_level(block, system), floor=floor, noise_gain=noise.gain,
+        tolerance=fit.tolerance, max_iterations=fit.max_iterations, whitening=whitening, **options,
     )  # fmt: skip
 
 

@@ -168,8 +168,21 @@ def richardson_lucy(
 
     def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
         profile = deconvolve_richardson_lucy(signal, given.taps, BACKGROUND * std, iterations)
-        waveform, time, amplitude = _find_spikes(profile, half, np.float32(least) * std)
-        return waveform, time + (given.peak - given.middle), amplitude
+        # A spike reaches `half` samples around its peak, or halfway to the next peak; its sum counts.
+        lowest, s = np.float32(least) * std, len(profile)
+        waveform, sample = find_peaks(profile, 0.1 * lowest / half)
+        low, high = np.maximum(sample - half, 0), np.minimum(sample + half + 1, s)
+        same = waveform[1:] == waveform[:-1]
+        middle = (sample[1:] + sample[:-1] + 1) // 2
+        low[1:] = np.where(same, np.maximum(low[1:], middle), low[1:])
+        high[:-1] = np.where(same, np.minimum(high[:-1], middle), high[:-1])
+        spike, place = list_samples(waveform * s + low, waveform * s + high)
+        at = place % s
+        value = profile[at, place // s].astype(np.float64)
+        amplitude = np.bincount(spike, value, minlength=len(sample))
+        time = np.bincount(spike, value * at, minlength=len(sample)) / np.where(amplitude > 0, amplitude, 1.0)
+        keep = amplitude >= lowest[waveform]
+        return waveform[keep], time[keep] + (given.peak - given.middle), amplitude[keep]
 
     waveform, time, amplitude = _in_parts(signal[:, busy], noise.std[busy], detect, AT_A_TIME)
     return candidate_table(block, system, busy[waveform], time, amplitude)
@@ -178,27 +191,6 @@ def richardson_lucy(
 def spike_reach(ref: float) -> int:
     """Return how many samples a spike reaches to each side, for a system pulse of width `ref` [samples]."""
     return max(int(round(ref)), 1)
-
-
-def _find_spikes(profile: np.ndarray, half: int, least: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Waveform, centre and sum of the spikes in deconvolved waveforms (s, n) whose sum is at least `least` (n,).
-
-    A spike reaches `half` samples around its peak, or halfway to the next peak.
-    """
-    s = len(profile)
-    waveform, sample = find_peaks(profile, 0.1 * least / half)
-    low, high = np.maximum(sample - half, 0), np.minimum(sample + half + 1, s)
-    same = waveform[1:] == waveform[:-1]
-    middle = (sample[1:] + sample[:-1] + 1) // 2
-    low[1:] = np.where(same, np.maximum(low[1:], middle), low[1:])
-    high[:-1] = np.where(same, np.minimum(high[:-1], middle), high[:-1])
-    spike, place = list_samples(waveform * s + low, waveform * s + high)
-    at = place % s
-    value = profile[at, place // s].astype(np.float64)
-    amplitude = np.bincount(spike, value, minlength=len(sample))
-    time = np.bincount(spike, value * at, minlength=len(sample)) / np.where(amplitude > 0, amplitude, 1.0)
-    keep = amplitude >= least[waveform]
-    return waveform[keep], time[keep], amplitude[keep]
 
 
 Peaks = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -349,7 +341,14 @@ def asdf(
             minima = filters.find_minima(values, np.ascontiguousarray((correlations > gain * std).T))
             least = 2 * gain * std * np.maximum(height, 0)
         kept = minima.take(filters.keep_prominent(minima, least))
-        shift, peaked = _refine(values, correlations, kept, interpolation == "log")
+        # Distance from the minima to the peak [samples], and whether the correlation peaks there.
+        waveform, row = kept.waveform, kept.row
+        shift = parabola_shift(*(values[waveform, row + d] for d in (-1, 0, 1)))
+        near = [correlations[row + d, waveform] for d in (-1, 0, 1)]
+        positive = (near[0] > 0) & (near[1] > 0) & (near[2] > 0)
+        by_log = parabola_shift(*(-logarithm(np.where(positive, y, 1).astype(np.float64)) for y in near))
+        peaked = positive & (np.abs(by_log) < 1.5)
+        shift = np.where(peaked & (interpolation == "log"), by_log, shift)
         time = kept.row - (len(given.taps) - 1) + given.peak + shift
         amplitude = correlations[kept.row, kept.waveform] / np.sum(given.taps**2)
         inside = (time >= 0) & (time <= len(signal) - 1) & (peaked | (rule == "paper"))
@@ -383,19 +382,6 @@ def parabola_bias(width: float) -> float:
     phase = np.linspace(-0.5, 0.5, 41)
     near = [-exp(-((lag - phase) ** 2) / (4 * width * width)) for lag in (-1, 0, 1)]
     return float(np.sqrt(np.mean((parabola_shift(*near) - phase) ** 2)))
-
-
-def _refine(
-    values: np.ndarray, correlations: np.ndarray, minima: filters.Minima, log: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from minima of values (n, rows) to the peak [samples]; whether the correlation (rows, n) peaks there."""
-    waveform, row = minima.waveform, minima.row
-    shift = parabola_shift(*(values[waveform, row + d] for d in (-1, 0, 1)))
-    near = [correlations[row + d, waveform] for d in (-1, 0, 1)]
-    positive = (near[0] > 0) & (near[1] > 0) & (near[2] > 0)
-    by_log = parabola_shift(*(-logarithm(np.where(positive, y, 1).astype(np.float64)) for y in near))
-    peaked = positive & (np.abs(by_log) < 1.5)
-    return np.where(peaked & log, by_log, shift), peaked
 
 
 def parabola_shift(before: np.ndarray, here: np.ndarray, after: np.ndarray) -> np.ndarray:

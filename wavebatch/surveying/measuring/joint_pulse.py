@@ -15,7 +15,8 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import gather_pulse
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, refine_gaussians
-from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
+from wavebatch.kernels.fit.pulse_shape import measure_pulse
+from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.judge import Explained, find_own_width, sample_noise
 
 BEFORE, CORE, AFTER = 5.0, 4.0, 40.0
@@ -104,7 +105,7 @@ def learn_jointly(
     components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in best.components)
     system = replace(system, components=components, ringing=float(np.abs(stack.value[far]).max(initial=0.0)))
     limits = shape_limits(system, spacing)
-    table = pulse_measures(pulse_shape(system, spacing), limits)
+    table = measure_pulse(pulse_shape(system, spacing), limits.low, limits.high)
     full = float(np.interp(limits.ref, table.width, table.half_width))
     return replace(system, sigma_ref=full / FWHM_PER_SIGMA * spacing)
 

@@ -11,10 +11,10 @@ from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
-from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse, measure_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import floor_level, pulse_measures, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import floor_level, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, SMALL, find_edge, fit_lone
 from wavebatch.surveying.systems.figures import Figures
 
@@ -211,7 +211,7 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
         components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
         system = replace(system, components=components)
         limits = shape_limits(system, spacing)
-        table = pulse_measures(pulse_shape(system, spacing), limits)
+        table = measure_pulse(pulse_shape(system, spacing), limits.low, limits.high)
         half_width = float(np.interp(limits.ref, table.width, table.half_width))
         return replace(system, sigma_ref=half_width / FWHM_PER_SIGMA * spacing)
     if fit.kappa:

@@ -194,7 +194,7 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
     strong, weaker = part_strong(clear)
     if len(strong) < ENOUGH_FOR_TAIL:
         return system
-    left, others, profile = Left(block, system, strong), None, []
+    left, others, profile = ResidualShares(block, system, strong), None, []
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
         if abs(place) < 3 or (seen := left.look(place)).number < ENOUGH_FOR_TAIL:
             continue
@@ -209,7 +209,7 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
             is_part |= all_have
         if is_part and len(weaker) >= ENOUGH_FOR_TAIL:
             # A tail is the same share of weaker echoes, neighbours are a larger one.
-            others = others or Left(block, system, weaker)
+            others = others or ResidualShares(block, system, weaker)
             other = others.look(place)
             more = np.sign(seen.common) * other.common - abs(seen.common)
             is_part = more <= (LARGER if higher else SURE) * np.hypot(seen.error, other.error)
@@ -303,7 +303,7 @@ class Seen(NamedTuple):
         return COMMON_ERROR * self.spread / np.sqrt(self.number)
 
 
-class Left:
+class ResidualShares:
     """What a pulse leaves of single echoes, before and after them, as shares of their amplitudes."""
 
     def __init__(self, block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> None:

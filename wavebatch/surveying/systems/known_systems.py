@@ -10,8 +10,6 @@ strips of other sensors from getting one (tests/surveying/test_known_systems.py)
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -84,13 +82,9 @@ class KnownSystem:
     system: SystemPulse
 
 
-def known_systems() -> tuple[KnownSystem, ...]:
-    """Return the shipped pulses by name, without one that surveys must do without."""
-    return tuple(known for known in _load_all() if known.name != LEFT_OUT.get())
-
-
 @cache
-def _load_all() -> tuple[KnownSystem, ...]:
+def known_systems() -> tuple[KnownSystem, ...]:
+    """Return the shipped pulses by name."""
     found = []
     for path in sorted(Path(__file__).parent.glob("*.toml")):
         table = parse_toml(read_text(path, "system file"), str(path))
@@ -345,15 +339,3 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
     return 2 * most / max(len(echoes), 1)
 
 
-LEFT_OUT: ContextVar[str] = ContextVar("left_out", default="")
-"""Name of a shipped pulse that is not known now."""
-
-
-@contextmanager
-def leave_out(name: str) -> Iterator[None]:
-    """Let all surveys within do without a shipped pulse."""
-    token = LEFT_OUT.set(name)
-    try:
-        yield
-    finally:
-        LEFT_OUT.reset(token)

@@ -148,15 +148,6 @@ def describe_truth(truth: EchoTable, pulse: PulseModel) -> EchoTable:
     return replace(truth, sigma=_measure(pulse, truth.sigma.astype(np.float64)).astype(np.float32))
 
 
-def effective_noise(recording: Recording) -> float:
-    """Standard deviation of one sample [count] of white noise that disturbs an echo as much as the recorded noise.
-
-    Coloured noise: std of the [1 2 1]/4-smoothed samples over the gain for white noise (docs/algorithms.md H11).
-    """
-    smoothed = np.sqrt(smoothed_power(recording.color) / 16) / SMOOTH_GAIN
-    return float(np.hypot(recording.noise_std * smoothed, QUANTISATION_STD))
-
-
 def smoothed_power(color: np.ndarray | int) -> np.ndarray | float:
     """Variance of noise smoothed by [1 2 1], over that of its samples; color: as Recording.color."""
     first, second = color / (color + 1), color * (color - 1) / ((color + 1) * (color + 2))
@@ -190,7 +181,11 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     # Samples count by their inverse standard deviation; clipped ones do not.
     signal = np.zeros((n, recording.n_samples))
     np.add.at(signal, truth.waveform, echo)
-    variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
+    # White noise that disturbs an echo as much as the recorded noise. Coloured noise: std of the [1 2 1]/4-smoothed
+    # samples over the gain for white noise (docs/algorithms.md H11).
+    smoothed = np.sqrt(smoothed_power(recording.color) / 16) / SMOOTH_GAIN
+    noise = float(np.hypot(recording.noise_std * smoothed, QUANTISATION_STD))
+    variance = noise**2 + recording.noise_gain * np.maximum(signal, 0)
     weight = np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
     columns *= weight[truth.waveform][:, None, :]
     bounds = np.full((len(truth), 3), np.inf)

@@ -160,7 +160,17 @@ def _measure_scene(
              if row["kind"] == "chain" else (None,) * 3 for row in rows]  # fmt: skip
     for row, best in zip(rows, accuracy.find_front(costs).tolist(), strict=True):
         row["pareto"] = best
-    section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
+    # Range of the results of the groups' surveys.
+    fields = {"noise_std": "noise.std", "noise_gain": "noise.gain"}
+    names = ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
+    values = {name: map(attrgetter(fields.get(name, name)), (group.system for group in groups)) for name in names}
+    survey = {
+        "groups": len(groups),
+        "waveforms_of_a_group": len(groups[0].block),
+        **{name: accuracy.median_range([float(value) for value in found]) for name, found in values.items()},
+        "components": sorted({len(group.system.components) for group in groups}),
+    }
+    section = {"scene": scene.name, "meaning": scene.meaning, "survey": survey, "rows": rows}
     if options.tolerance_cm is not None:
         cheapest = accuracy.choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
         section["cheapest"] = cheapest["name"] if cheapest else None
@@ -173,19 +183,6 @@ def make_row(name: str, kind: str, tally: accuracy.AccuracyTally, laps: Laps) ->
     found = asdict(laps).items()
     times = {key: accuracy.median_range(value) if isinstance(value, list) else value for key, value in found}
     return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **times}
-
-
-def _describe(groups: list[accuracy.Group]) -> dict[str, Any]:
-    """Range of the results of the groups' surveys."""
-    fields = {"noise_std": "noise.std", "noise_gain": "noise.gain"}
-    names = ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
-    values = {name: map(attrgetter(fields.get(name, name)), (group.system for group in groups)) for name in names}
-    return {
-        "groups": len(groups),
-        "waveforms_of_a_group": len(groups[0].block),
-        **{name: accuracy.median_range([float(value) for value in found]) for name, found in values.items()},
-        "components": sorted({len(group.system.components) for group in groups}),
-    }
 
 
 # Chains

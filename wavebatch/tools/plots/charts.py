@@ -270,19 +270,6 @@ def picture_cloud(path: Path, columns: Sequence[str]) -> Iterator[Sheet]:
         yield Sheet("Maps", maps)
 
 
-def _keep(
-    kept: list[tuple[float, WaveformView]], block: WaveformBlock, chain: Chain, system: SystemPulse, keys: np.ndarray,
-    most: int,
-) -> list[tuple[float, WaveformView]]:  # fmt: skip
-    """The waveforms with the `most` least keys of those kept so far and of the block."""
-    rows = np.argsort(keys, kind="stable")[:most]
-    rows = np.sort(rows[np.isfinite(keys[rows])])
-    if not len(rows):
-        return kept
-    views = build_views(block.rows(rows), chain, system, [-1] * len(rows))
-    return sorted([*kept, *zip(keys[rows].tolist(), views, strict=True)], key=lambda pair: pair[0])[:most]
-
-
 def measure_view_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -> np.ndarray:
     """Root mean square of each waveform's residual in standard deviations of the noise, f8 (n,); NaN without a model.
 
@@ -303,18 +290,22 @@ def draw_waveforms(path: Path, chain: Chain, system: SystemPulse, name: str, **r
     reading: direction and headerless. Raises InputError if the strip cannot be read.
     """
     generator, searched = np.random.default_rng(0), 0
-    drawn: list[tuple[float, WaveformView]] = []
-    worst: list[tuple[float, WaveformView]] = []
+    kept: tuple[list[tuple[float, WaveformView]], ...] = ([], [])
     with StripReader(path, **reading) as reader, reader.scan() as scan:
         total = scan.packets
         for block in reader.sample_blocks(scan, min(SEARCHED, sample_size(reader, scan))):
             searched += len(block)
             residual = measure_view_residuals(block, chain, system)
-            # The least of random numbers, kept over all blocks, draw each waveform with the same chance.
-            order = generator.random(len(block))
-            drawn = _keep(drawn, block, chain, system, order, SHOWN_RANDOM)
-            worst = _keep(worst, block, chain, system, -residual, SHOWN_WORST)
-    worst = [pair for pair in worst if np.isfinite(pair[0])]
+            # The least keys of all blocks are kept; those of random numbers draw each waveform with the same chance.
+            every = generator.random(len(block)), -residual
+            for best, keys, most in zip(kept, every, (SHOWN_RANDOM, SHOWN_WORST), strict=True):
+                rows = np.argsort(keys, kind="stable")[:most]
+                rows = np.sort(rows[np.isfinite(keys[rows])])
+                if len(rows):
+                    views = build_views(block.rows(rows), chain, system, [-1] * len(rows))
+                    best += zip(keys[rows].tolist(), views, strict=True)
+                    best[:] = sorted(best, key=lambda pair: pair[0])[:most]
+    drawn, worst = kept
     whole = f"all {searched:,} waveforms"
     part = f"{searched:,} waveforms that are spread over the strip ({total:,} in all)"
     head = (

@@ -168,7 +168,7 @@ def _draw_panels(
     size = 9 if small else 10.5
     parts = [f"packet {view.packet}"] if view.packet >= 0 else []
     parts += [f"point {view.point}"] + ([] if small else [f"GPS time {view.gps_time:.6f} s"])
-    if view.span_is_cut(times):
+    if times[0] > 0.0 or times[1] < float(view.time[-1]):  # some samples are not shown
         parts.append(f"{max(times[0], 0):.0f} to {min(times[1], view.time[-1]):.0f} of {view.time[-1]:.0f} ns")
     lines = ["   ".join(parts)]
     if view.seen is not None:

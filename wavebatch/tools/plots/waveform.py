@@ -312,10 +312,6 @@ class WaveformView:
         low = max(float(marks.min()) - BEFORE * FWHM_PER_SIGMA * sigma, -edge)
         return low, max(min(float(marks.max()) + AFTER * sigma, end + edge), low + 1.0)
 
-    def span_is_cut(self, times: tuple[float, float]) -> bool:
-        """Whether some samples lie outside of the times that are shown."""
-        return times[0] > 0.0 or times[1] < float(self.time[-1])
-
 
 def read_views(
     reader: StripReader,
@@ -405,12 +401,6 @@ def add_ranges(
     return Chain((*chain.steps, *step), chain.name), source.fill, source.error
 
 
-def name_chain(chain: Chain) -> str:
-    """Name, detector and decomposer of a chain, with the parameters that it sets."""
-    detector, decomposer = (describe_step(step) for step in chain.steps[1:3])
-    return f"{chain.name.removeprefix('profile ') or 'chain'}: {detector}, {decomposer}"
-
-
 # What a detector saw
 
 @frozen(eq=False)
@@ -484,11 +474,6 @@ _FLAGS_WIDE = 50
 _NAMES = {"time": "echo_time", "amplitude": "amplitude", "sigma": "echo_width"}
 
 
-def name_flags(flags: int) -> str:
-    """Names of EchoFlag bits, separated by commas; empty without any."""
-    return ", ".join(flag.name for flag in EchoFlag(flags))
-
-
 def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
     """A table of the echoes, for a monospaced font: time, amplitude, width, range if it is known, and flags."""
     several, ranged = len(views) > 1, any(np.isfinite(_column(view, "range")).any() for view in views)
@@ -501,7 +486,8 @@ def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
         front = [str(view.packet) if view.packet >= 0 else "-"] * several + [str(row + 1)]
         pairs = [*_measures(view, row), *[[_column(view, name)[row] for name in ("range", "range_error")]] * ranged]
         front += [format_measure(value, error, "\N{PLUS-MINUS SIGN}") for value, error in pairs]
-        rows.append([front, textwrap.wrap(name_flags(int(view.echoes.flags[row])) or "-", _FLAGS_WIDE)])
+        flags = ", ".join(flag.name for flag in EchoFlag(int(view.echoes.flags[row])))
+        rows.append([front, textwrap.wrap(flags or "-", _FLAGS_WIDE)])
     widths = [max(len(front[place]) for front, _ in rows) for place in range(len(head))]
     lines = []
     for front, flags in rows:
@@ -526,7 +512,7 @@ def format_echoes(views: Sequence[WaveformView]) -> str:
         for row in range(len(view.echoes)):
             texts = [_cell(value, 9) for pair in _measures(view, row) for value in pair]
             texts += [_cell(_column(view, name)[row], 9 if name not in ("x", "y", "z") else 13) for name in rest]
-            flags = name_flags(int(view.echoes.flags[row])).replace(", ", " ")
+            flags = " ".join(flag.name for flag in EchoFlag(int(view.echoes.flags[row])))
             table.append([*place, row + 1, *texts, flags])
         if not len(view.echoes):
             table.append([*place, *[""] * (len(head) - 2)])

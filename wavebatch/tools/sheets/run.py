@@ -164,7 +164,23 @@ def _list_parts(
 ) -> Iterator[Part]:  # fmt: skip
     whole = result.report.to_json()
     counts = whole["counts"]
-    yield Sheet("Summary", _summarise(result, counts))
+    states = [outcome.status for outcome in result.outcomes]
+    summary: list[Part] = [
+        Fact("strips written", f"{len(states) - result.failed} of {len(states)}"),
+        Fact("with warnings", sum(bool(outcome.report.warnings) for outcome in result.outcomes)),
+        *(Fact(name.replace("_", " "), counts[name]) for name in ("points_in", "waveforms", "echoes", "added_echoes")),
+        Fact("passed through", sum(counts["passed_through"].values())),
+    ]
+    if left := sum(counts["left_out"].values()):
+        summary.append(Fact("left out", left))
+    summary.append(Fact("points out", counts["points_out"]))
+    if "skipped" in states:
+        summary.append(Note(f"{states.count('skipped')} of the strips were up to date (--resume)."))
+    if "incomplete" in states:
+        summary.append(Note(f"{states.count('incomplete')} of the strips are incomplete: packets are missing."))
+    if advice := result.advice:
+        summary.append(Note(advice))
+    yield Sheet("Summary", summary)
     failed = [Note(f"{one.outcome.job.path}: {' '.join(str(one.outcome.error).split())}", "warning") for one in strips
               if one.outcome.error is not None]  # fmt: skip
     if failed:
@@ -186,24 +202,6 @@ def _list_parts(
     if timing["waveforms_per_processor_second"]:
         facts.append(Fact("waveforms per second of a processor", timing["waveforms_per_processor_second"]))
     yield Sheet("Run", [*facts, *([Code(command)] if command else [])], "run")
-
-
-def _summarise(result: BatchResult, counts: dict[str, Any]) -> Iterator[Part]:
-    states = [outcome.status for outcome in result.outcomes]
-    yield Fact("strips written", f"{len(states) - result.failed} of {len(states)}")
-    yield Fact("with warnings", sum(bool(outcome.report.warnings) for outcome in result.outcomes))
-    for name in ("points_in", "waveforms", "echoes", "added_echoes"):
-        yield Fact(name.replace("_", " "), counts[name])
-    yield Fact("passed through", sum(counts["passed_through"].values()))
-    if left := sum(counts["left_out"].values()):
-        yield Fact("left out", left)
-    yield Fact("points out", counts["points_out"])
-    if "skipped" in states:
-        yield Note(f"{states.count('skipped')} of the strips were up to date (--resume).")
-    if "incomplete" in states:
-        yield Note(f"{states.count('incomplete')} of the strips are incomplete: packets are missing.")
-    if advice := result.advice:
-        yield Note(advice)
 
 
 def _list_index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int]) -> Iterator[Part]:

@@ -361,8 +361,9 @@ def write_angles(
 ) -> None:
     """Writes the table of a strip as .csv, or draws it; distance: of the sensor [m]; strip: its name, for the title.
 
+    A picture has the angles, and their errors for echoes of each table's amplitude. Empty cells of a .csv are no data.
     Raises ConfigError where the beam is not known, InputError where the sensor's position is not known or no width of
-    this system means an angle.
+    this system means an angle; and as figure_file.open_picture does.
     """
     system, figures = survey.system, survey.figures
     if not system.radiometry.divergence:
@@ -375,29 +376,16 @@ def write_angles(
         tabulate_angles(system, figures.spacing_ns, distance, system.radiometry.divergence, part * figures.amplitude_50)
         for part in DRAWN
     ]
+    found = tables[0]
     if target.suffix.lower() == ".csv":
-        write_text(target, format_angles(tables[0]), overwrite=overwrite)
-    else:
-        draw_angles(tables, target, strip=strip, overwrite=overwrite)
-
-
-def format_angles(found: AngleTable) -> str:
-    """The table as CSV; empty cells are no data."""
-    head = ("angle_deg", "spread_ns", "echo_width_ns", "angle_err_deg", "distance_m", "divergence_mrad",
-            "amplitude_DN")  # fmt: skip
-    same = map(float, (found.distance, found.divergence, found.amplitude))
-    columns = (found.angle, found.spread, found.width, found.error, *(np.full(len(found.angle), one) for one in same))
-    return sheets.format_csv(head, zip(*columns, strict=True), digits=6)
-
-
-def draw_angles(tables: Sequence[AngleTable], target: Path, *, strip: str = "", overwrite: bool = False) -> None:
-    """Writes a picture of the angles, and of their errors for echoes of each table's amplitude.
-
-    Raises as figure_file.open_picture does.
-    """
+        head = ("angle_deg", "spread_ns", "echo_width_ns", "angle_err_deg", "distance_m", "divergence_mrad",
+                "amplitude_DN")  # fmt: skip
+        same = (np.full(len(found.angle), float(one)) for one in (found.distance, found.divergence, found.amplitude))
+        columns = found.angle, found.spread, found.width, found.error, *same
+        write_text(target, sheets.format_csv(head, zip(*columns, strict=True), digits=6), overwrite=overwrite)
+        return
     from wavebatch.tools.plots.draw_cloud import SERIES
 
-    found = tables[0]
     with open_picture(target, (7.0, 6.0), overwrite=overwrite) as figure:
         axes, errors = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
         axes.plot(found.width, found.angle, color=SERIES[0], linewidth=1.5)

@@ -216,7 +216,9 @@ class LightModel:
         if self.options.shares is not None:
             known_shares = over = 0
             if self._read_share is None:
-                share = share_equally(rows["total"], starts)
+                # Returns that the cloud lacks, by the numbers that the points state, take their share, too.
+                number = np.diff(np.append(starts, len(rows)))
+                share = 1.0 / np.maximum(np.repeat(number, number), rows["total"])
             else:
                 share = self._read_share(records).astype(float)
                 wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
@@ -244,16 +246,6 @@ class LightModel:
                 f"{self.path}: --widths {self.options.widths}: {counts.limited_width} of {counts.own_width} values are "
                 f"outside of {least:.2g} to {most:.0f} ns; give a column with the width of each echo in ns"
             )
-
-
-def share_equally(total: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Equal shares of the returns of whole pulses, f8 (k,).
-
-    total: number of returns that the points state, (k,): returns that the cloud lacks take their share, too. starts:
-    first return of each pulse.
-    """
-    number = np.diff(np.append(starts, len(total)))
-    return 1.0 / np.maximum(np.repeat(number, number), total)
 
 
 def fill_shares(share: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]:

@@ -245,14 +245,41 @@ def simulate_strip(
             if truth_writer:
                 packet = summary.packets + np.cumsum(stored) - 1
                 truth_writer.add({"packet_byte_offset": offset[rows], "packet_gps_time": block.gps_time[rows]})
-                truth_writer.add(_list_truth(Simulated(block, kept, simulated.rays), packet, offset))
+                # The echoes in stored packets.
+                waveform, rays = kept.waveform, simulated.rays
+                xyz = block.origin[waveform] + kept.time[:, None] * block.direction[waveform]
+                speed = np.linalg.norm(block.direction[waveform], axis=1)
+                past_ground = np.einsum("ij,ij->i", xyz - rays.ground[waveform], block.direction[waveform]) / speed
+                truth_writer.add({
+                    "waveform": packet[waveform],
+                    "byte_offset": offset[waveform],
+                    "gps_time": block.gps_time[waveform],
+                    "time": kept.time,
+                    "amplitude": kept.amplitude,
+                    "sigma": kept.sigma,
+                    **dict(zip("xyz", xyz.T, strict=True)),
+                    "incidence_angle": np.degrees(rays.incidence[waveform]),
+                    "range": rays.distance[waveform] + past_ground,
+                    "flags": kept.flags,
+                    "isolated": find_isolated_echoes(kept),
+                    "overlapped": (kept.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0,
+                })  # fmt: skip
             summary.pulses += n
             summary.packets += len(rows)
             summary.points += len(points)
             summary.echoes += len(kept)
         if truth_writer:
-            meta = json.dumps(_describe(scene, seed, summary), sort_keys=True)
-            writer.drafts.insert(0, truth_writer.complete({_META: meta}))
+            recording = scene.recording
+            meta = {
+                "scene": scene.name,
+                "seed": seed,
+                "noise_std": recording.recorded_noise,
+                "spacing": recording.spacing,
+                "n_samples": recording.n_samples,
+                "recording": asdict(recording),
+                **asdict(summary),
+            }
+            writer.drafts.insert(0, truth_writer.complete({_META: json.dumps(meta, sort_keys=True)}))
         writer.commit()
     return summary
 
@@ -340,40 +367,3 @@ def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale:
         points["raw_classification"] = ground_or_plants
         points["scan_angle_rank"] = np.rint(scan_angle)
     return points
-
-
-def _list_truth(simulated: Simulated, packet: np.ndarray, offset: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of the truth file for the echoes in stored packets; packet, offset: of every pulse, (n,)."""
-    block, truth, rays = simulated.block, simulated.truth, simulated.rays
-    rows = truth.waveform
-    xyz = block.origin[rows] + truth.time[:, None] * block.direction[rows]
-    speed = np.linalg.norm(block.direction[rows], axis=1)
-    past_ground = np.einsum("ij,ij->i", xyz - rays.ground[rows], block.direction[rows]) / speed
-    return {
-        "waveform": packet[rows],
-        "byte_offset": offset[rows],
-        "gps_time": block.gps_time[rows],
-        "time": truth.time,
-        "amplitude": truth.amplitude,
-        "sigma": truth.sigma,
-        **dict(zip("xyz", xyz.T, strict=True)),
-        "incidence_angle": np.degrees(rays.incidence[rows]),
-        "range": rays.distance[rows] + past_ground,
-        "flags": truth.flags,
-        "isolated": find_isolated_echoes(truth),
-        "overlapped": (truth.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0,
-    }
-
-
-def _describe(scene: Scene, seed: int, summary: StripSummary) -> dict:
-    """The `meta` of the truth file: what holds for the whole strip."""
-    recording = scene.recording
-    return {
-        "scene": scene.name,
-        "seed": seed,
-        "noise_std": recording.recorded_noise,
-        "spacing": recording.spacing,
-        "n_samples": recording.n_samples,
-        "recording": asdict(recording),
-        **asdict(summary),
-    }

@@ -230,16 +230,15 @@ class CellMap:
         local = xyz - self._middle
         index = np.floor(local[:, :2] / self.cell)
         good = (np.abs(index) < _REACH).all(axis=1) & np.isfinite(xyz[:, 2])
-        self._keep_outermost(np.concatenate([self._kept, local[good]]))
-        while len(self._key) > self._most:
+        self._kept = np.concatenate([self._kept, local[good]])
+        while True:  # the outermost one of each cell stays
+            local, key = self._kept, self._key_of(self._kept)
+            order = np.lexsort((local[:, 1], local[:, 0], self._sign * local[:, 2], key))
+            first = np.append(True, np.diff(key[order]) != 0)[: len(key)]
+            self._key, self._kept = key[order][first], local[order][first]
+            if len(self._key) <= self._most:
+                break
             self.cell *= 2.0
-            self._keep_outermost(self._kept)
-
-    def _keep_outermost(self, local: np.ndarray) -> None:
-        key = self._key_of(local)
-        order = np.lexsort((local[:, 1], local[:, 0], self._sign * local[:, 2], key))
-        first = np.append(True, np.diff(key[order]) != 0)[: len(key)]
-        self._key, self._kept = key[order][first], local[order][first]
 
     def _key_of(self, local: np.ndarray) -> np.ndarray:
         """Keys of the cells, i8 (m,), of positions from the middle (m, 3)."""
