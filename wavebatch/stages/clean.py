@@ -7,7 +7,7 @@ samples are float32, so that a block that was cleaned is known by its samples.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,6 @@ from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.defects import (
     fill_spikes,
     find_pattern,
-    find_seam,
     find_spikes,
     find_transient,
     fit_slopes,
@@ -126,12 +125,6 @@ def mark_seam(block: WaveformBlock, seams: Mapping[int, int]) -> WaveformBlock:
     missing = np.zeros(block.samples.shape, bool) if block.missing is None else block.missing.copy()
     missing[:, at] = True
     return replace(block, missing=missing)
-
-
-def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:
-    """Return the seams of packets by their number of samples (`find_seam`)."""
-    found = {block.digitizer.n_samples: find_seam(block.samples) for block in blocks}
-    return {length: at for length, at in found.items() if at}
 
 
 def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:

@@ -11,7 +11,8 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
-from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
+from wavebatch.kernels.signal.defects import find_seam
+from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
 from wavebatch.surveying.measuring.choose_pulse import bear, choose_pulse, settle
@@ -87,7 +88,8 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
     joined = join_digitizers(blocks)
     if not joined:
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
-    seams = find_seams(joined)
+    places = {block.digitizer.n_samples: find_seam(block.samples) for block in joined}
+    seams = {length: at for length, at in places.items() if at}
     # Descriptors that differ in length only are pooled, the largest first.
     kinds: dict[tuple[float, ...], list[WaveformBlock]] = {}
     for block in joined:

@@ -251,10 +251,6 @@ class AreaTally:
         put("depth", area[pulses], 0, depth)
         self._join(areas, sums)
 
-    def merge(self, other: AreaTally) -> None:
-        """Adds the sums of another cloud."""
-        self._join(other._areas, other._sums)
-
     def _join(self, areas: np.ndarray, more: np.ndarray) -> None:
         """Adds sums of areas, which are ascending and unique."""
         known = np.union1d(self._areas, areas)
@@ -545,7 +541,7 @@ class _Tally:
         self.depth += other.depth
         self.distances += other.distances
         for area, more in zip((self.whole, *self.areas), (other.whole, *other.areas), strict=True):
-            area.merge(more)
+            area._join(more._areas, more._sums)
         if other.flags is not None:
             self.flags = other.flags + (0 if self.flags is None else self.flags)
 

@@ -241,9 +241,23 @@ def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, set
 def _as_problem(
     samples: Samples, candidates: Candidates, clusters: Clusters, settings: Settings
 ) -> tuple[library.Block, library.CClusters, library.CSettings]:
-    """The structures of one call; each holds the arrays to which it points."""
+    """The structures of one call; each holds the arrays to which it points.
+
+    Raises ValueError where the library would read outside of an array.
+    """
     samples = samples.checked()
-    candidates, clusters = _check(samples, candidates, clusters)
+    n, s = samples.counts.shape
+    waveform, low, high, first, number = clusters
+    m = len(candidates.time)
+    if {len(column) for column in clusters} != {len(number)} or {len(column) for column in candidates[1:]} != {m}:
+        raise ValueError("the columns of clusters or candidates differ in length")
+    inside = (waveform >= 0) & (waveform < n) & (low >= 0) & (low < high) & (high <= s)
+    if not (inside & (number > 0) & (first >= 0) & (first + number <= m)).all():
+        raise ValueError("a window lies outside of its waveform, or its candidates outside of their table")
+    if not all(np.isfinite(column).all() for column in candidates[1:]):
+        raise ValueError("candidates must be finite")
+    candidates = Candidates(*(np.ascontiguousarray(field, np.float64) for field in candidates))
+    clusters = Clusters(*(np.ascontiguousarray(field, np.int64) for field in clusters))
     windows = library.CClusters(
         len(clusters.number), *(place(field, np.int64) for field in clusters),
         *(place(field, np.float64) for field in (candidates.amplitude, candidates.time, candidates.width)),
@@ -265,24 +279,6 @@ def _as_problem(
     structure = library.CSettings(**values)
     structure.arrays = pulse.arrays
     return samples.as_block(), windows, structure
-
-
-def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tuple[Candidates, Clusters]:
-    """The same as the library reads them; raises ValueError where it would read outside of them."""
-    n, s = samples.counts.shape
-    waveform, low, high, first, number = clusters
-    m = len(candidates.time)
-    if {len(column) for column in clusters} != {len(number)} or {len(column) for column in candidates[1:]} != {m}:
-        raise ValueError("the columns of clusters or candidates differ in length")
-    inside = (waveform >= 0) & (waveform < n) & (low >= 0) & (low < high) & (high <= s)
-    if not (inside & (number > 0) & (first >= 0) & (first + number <= m)).all():
-        raise ValueError("a window lies outside of its waveform, or its candidates outside of their table")
-    if not all(np.isfinite(column).all() for column in candidates[1:]):
-        raise ValueError("candidates must be finite")
-    return (
-        Candidates(*(np.ascontiguousarray(field, np.float64) for field in candidates)),
-        Clusters(*(np.ascontiguousarray(field, np.int64) for field in clusters)),
-    )
 
 
 def as_pulse(shape: PulseShape) -> library.Pulse:

@@ -17,11 +17,11 @@ import numpy as np
 
 from wavebatch.kernels import library
 from wavebatch.kernels.geometry.planes import (
+    FLAT,
     Planes,
     compare_halves,
     fit_planes,
     in_two_lines,
-    is_flat,
     measure_angles,
     misfit_of_angles,
 )
@@ -336,7 +336,8 @@ def _judge(
     count = np.bincount(point, minlength=n)
     planes = fit_planes(offset, point, n)
     angle, error = measure_angles(planes, unit)
-    surface = is_flat(planes.spreads) & (planes.kept >= LEAST_KEPT * count) & (planes.kept >= min_points)
+    flat = planes.spreads[:, 0] <= FLAT * planes.spreads[:, 1]
+    surface = flat & (planes.kept >= LEAST_KEPT * count) & (planes.kept >= min_points)
     surface &= planes.offset() <= planes.limit
     folded = np.zeros(n)
     rows = np.flatnonzero(surface)

@@ -140,11 +140,6 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
     return Planes(axes, spreads, centre, left, limit)
 
 
-def is_flat(spreads: np.ndarray) -> np.ndarray:
-    """Whether points with variances `spreads` along their axes (n, 3) lie in a plane, bool (n,)."""
-    return spreads[:, 0] <= FLAT * spreads[:, 1]
-
-
 def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Angle between rays and the normals of planes.
 

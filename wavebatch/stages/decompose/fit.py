@@ -21,7 +21,7 @@ from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference, render_table, skew_system, skewed
 from wavebatch.stages.decompose.solve import FIT, EchoLimits, FitOptions, fit_candidates, fit_gaussian, make_settings
-from wavebatch.stages.detect.direct import candidate_table, find_varying, maximum, signal_above
+from wavebatch.stages.detect.direct import candidate_table, maximum, signal_above
 from wavebatch.stages.flags import flag_echoes
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, fit_misfit, pulse_shape, shape_limits
 
@@ -265,7 +265,7 @@ def residual_loop(
         limit = np.maximum(t_diff * np.max(block.samples - noise.level, axis=1, initial=0), noise.std)
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
-    varies = find_varying(block.samples)
+    varies = (block.samples != block.samples[:, :1]).any(axis=1)
     parts: list[EchoTable] = []
     while len(rows) or not parts:
         found = _LOOP_FITS[fitted](block, noise, system, echoes, **options)

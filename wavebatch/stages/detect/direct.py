@@ -131,27 +131,12 @@ def make_table(
     kept = np.ones(len(waveform), bool)
     if not varies:
         rows, row = np.unique(waveform, return_inverse=True)
-        kept = find_varying(block.samples[rows])[row]
+        samples = block.samples[rows]
+        kept = (samples != samples[:, :1]).any(axis=1)[row]
     if block.missing is not None:
         kept &= gap_distance(block.missing, waveform, time) > -1.0
     columns = (waveform, time * block.spacing, amplitude, width * block.spacing)
     return EchoTable.build(*(columns if kept.all() else (values[kept] for values in columns)))
-
-
-def find_varying(samples: np.ndarray) -> np.ndarray:
-    """Find the waveforms that are not constant.
-
-    Parameters
-    ----------
-    samples : uint array, shape (n, s)
-        Raw counts.
-
-    Returns
-    -------
-    bool array, shape (n,)
-        True where samples differ.
-    """
-    return (samples != samples[:, :1]).any(axis=1)
 
 
 def candidate_table(

@@ -43,14 +43,18 @@ _PIECE = 100_000
 
 def open_heights(
     paths: Sequence[Path], column: str | None, chosen: PointFilter
-) -> cells.Clouds | VoxelFile | SegmentFiles:
+) -> tuple[cells.Clouds | VoxelFile | SegmentFiles, CrsWords]:
     """Clouds or one file of voxels, whose rows have the height as second value; segments have those of both ends."""
     if is_segments(paths[0]):
-        return SegmentFiles(paths, column)
+        return SegmentFiles(paths, column), CrsWords()
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
-    return VoxelFile(paths[0], column, chosen) if voxels else cells.Clouds(paths, (column, "z"), chosen)
+    if voxels:
+        voxel = VoxelFile(paths[0], column, chosen)
+        return voxel, CrsWords(voxel.crs)
+    clouds = cells.Clouds(paths, (column, "z"), chosen)
+    return clouds, cells.check_crs(clouds.paths)
 
 
 @frozen(eq=False)
@@ -91,9 +95,8 @@ def cut_section(
     fiftieth of the line, for voxels at least one voxel. most: an even sample of so many points at the most. Raises
     InputError if no point lies there.
     """
-    clouds = open_heights(paths, column, chosen)
+    clouds, crs = open_heights(paths, column, chosen)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
-    crs = _find_crs(clouds)
     if crs.unit == "deg":
         raise ConfigError(f"{paths[0]}: coordinates are degrees, heights are not: project the cloud to draw a section")
     if line is None:  # through the middle of the points, along their longer extent
@@ -145,12 +148,6 @@ def cut_section(
     names = tuple(path.name for path in paths)
     return Section(clouds.facts, names, total, tuple(map(float, line)), width, far, height, value, sample.seen, outside,
                    shown, voxel, crs)  # fmt: skip
-
-
-def _find_crs(clouds: cells.Clouds | VoxelFile | SegmentFiles) -> CrsWords:
-    if isinstance(clouds, SegmentFiles):
-        return CrsWords()
-    return CrsWords(clouds.crs) if isinstance(clouds, VoxelFile) else cells.check_crs(clouds.paths)
 
 
 def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
@@ -212,8 +209,7 @@ def measure_profile(
     size: height of a bin, by default about a sixtieth of all. each: one series per cloud instead of one for all. Far
     outliers in height are left out and counted. Raises InputError without any value.
     """
-    clouds = open_heights(paths, column, chosen)
-    crs = _find_crs(clouds)
+    clouds, crs = open_heights(paths, column, chosen)
     cells.check_statistic(column, statistic, clouds.facts, paths[0])
 
     def pick(_: int, rows: np.ndarray) -> np.ndarray:
