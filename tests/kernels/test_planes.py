@@ -164,6 +164,16 @@ def test_a_plane_is_seldom_taken_for_two(count):
     assert (off == 0).mean() > 0.8 and (off >= 0).all()
 
 
+def test_a_ridge_on_two_scan_lines_is_no_plane():
+    """What is no surface is not called too few neighbours, however they lie."""
+    x, y = np.tile(np.linspace(-1.5, 1.5, 14), 2), np.repeat([0.0, 1.28], 14)
+    points = np.stack([x, y, 0.1 * np.abs(x)], axis=1)
+    ray, around = np.array([[0.0, 0.1, -1.0]]), normals.Surroundings(points)
+    gap = [normals.measure_normals(points[7:8], ray, around, radius=2.0, min_points=5, max_error=most)[1][0]
+           for most in (2.0, 20.0)]  # fmt: skip
+    assert gap == [normals.Gap.NO_PLANE, normals.Gap.FEW_NEIGHBOURS]
+
+
 def test_reasons():
     rng = np.random.default_rng(5)
     flat = np.column_stack([rng.uniform(0, 20, (1500, 2)), 0.01 * rng.standard_normal(1500)])
@@ -224,10 +234,15 @@ def test_points_that_cannot_be_cut_apart_are_one_tile():
     assert len(normals.cut_tiles(np.repeat([[0, 0, 0], [0, 0, 9.0]], [1000, 1], axis=0), 10, 0.0)) == 2
 
 
-def test_edges_are_found_by_the_pulses_around():
-    """Roofs 25 m above ground, in packets that reach 5 m: by brute force, and one lone echo is no surface."""
+@pytest.mark.parametrize(("gap", "edges"), [(0.0, 20), (1.2, 4)])
+def test_edges_are_found_by_the_pulses_around(gap, edges):
+    """Roofs 25 m above ground, in packets that reach 5 m: by brute force, and one lone echo is no surface.
+
+    Also where the nearest ground lies almost as far from a roof as is looked for.
+    """
     rng = np.random.default_rng(8)
     x, y = rng.uniform(0, 20, (2, 900))
+    x = np.where((x >= 9) & (x < 9 + gap), x + 2, x)
     level = np.stack([x, y, np.where(x < 9, 25.0, 0.0)], axis=1)
     ray = np.array([0.2, -0.1, -1.0]) / np.sqrt(1.05)
     points = level + (level[:, 2:] - 20.0) / ray[2] * ray * [1, 1, 0]
@@ -238,7 +253,7 @@ def test_edges_are_found_by_the_pulses_around():
     apart = np.linalg.norm(flat[:, None] - flat, axis=2)
     most = 1.0 + np.median(np.sort(apart, axis=1)[:, 4])
     deeper = (points @ ray)[None] - (points @ ray)[:, None] > 5.0
-    assert (found == ((deeper & (apart <= most)).sum(axis=1) > 1)).all() and 20 < found.sum() < 200
+    assert (found == ((deeper & (apart <= most)).sum(axis=1) > 1)).all() and edges < found.sum() < 200
     assert not found[points[:, 2] < 1].any()
 
 

@@ -1,5 +1,6 @@
 """A saved survey of another sensor is refused by every command with --system; one of the same sensor never is."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -49,6 +50,8 @@ def test_a_survey_that_is_only_shown_looks_for_no_other_strips(folder):
     assert shown.figures.look is None and not shown.figures.kinds
     saved = load_survey(folder / "SYSTEM.toml").survey
     assert saved.figures.look is not None and shown.system.sigma_ref == pytest.approx(saved.system.sigma_ref)
+    result = run_command("survey", folder / "flat.las", "--json")
+    assert "flight_width" in json.loads(result.stdout)["figures"], "all figures, although no file is written"
 
 
 def contradiction(strip, saved):

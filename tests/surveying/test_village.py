@@ -11,12 +11,29 @@ from helpers_scenes import make_scene
 
 from wavebatch.core.waveforms import Radiometry, SystemPulse
 from wavebatch.surveying import survey_block
-from wavebatch.surveying.flat_ground import Slopes, measure_reference
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying.flat_ground import LEAST_NEIGHBOURS, GroundReference, Slopes, choose_radius, measure_reference
 from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.render import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine, trace_rays
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT, simulate_seed_block
 
 SCENE = find_scene("village")
+
+
+@pytest.mark.parametrize(("seen", "error"), [(2.0, 1.2 * 1.6), (0.5, 0.55)])
+def test_the_error_of_a_beam_that_the_widths_contradict_is_that_of_the_farther_end(seen, error):
+    """A beam of 1 mrad, and one of 2 +- 0.2 or of 0.5 +- 0.05 by the widths: it may be 2.2 or 0.45 times as wide."""
+    system = SystemPulse(sigma_ref=2.0, radiometry=Radiometry(divergence=1.0))
+    assert GroundReference(system, 100, seen, 0.1).doubt_error() == pytest.approx(error)
+
+
+def test_the_radius_of_neighbourhoods_holds_enough_points(tmp_path):
+    sparse = replace(SCENE.flight, pulse_rate=0.1 * SCENE.flight.pulse_rate)
+    simulate_strip("village", tmp_path / "v.las", pulses=900, seed=3, flight=sparse)
+    xyz = laspy.read(tmp_path / "v.las").xyz
+    apart = np.sort(np.linalg.norm(xyz[:, None] - xyz, axis=2), axis=1)[:, LEAST_NEIGHBOURS * 3 // 2 - 1]
+    with StripReader(tmp_path / "v.las") as reader, reader.scan() as scan:
+        assert choose_radius(reader, scan) == pytest.approx(np.ceil(10 * np.quantile(apart, 0.9)) / 10)
 
 
 def call(*arguments):

@@ -151,6 +151,8 @@ def test_noise_is_no_signal(seed):
     empty = truth.count(len(block)) == 0
     seen = deconvolve_block(block, SYSTEM, Deconvolution()).seen
     assert seen[empty].mean() < 0.005 and seen[~empty].mean() > 0.98
+    louder = deconvolve_block(block, SYSTEM, Deconvolution(), np.random.default_rng(seed)).seen
+    assert louder[empty].mean() < 0.005, "nor where noise is added"
     loose = deconvolve_block(block, SYSTEM, Deconvolution(threshold=1.0)).seen
     assert loose[empty].mean() > 0.05
 
