@@ -10,8 +10,8 @@ from commands import run_command
 from helpers_scenes import make_scene
 
 from wavebatch.core.waveforms import Radiometry, SystemPulse
-from wavebatch.surveying import survey_block
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying import survey_block
 from wavebatch.surveying.flat_ground import LEAST_NEIGHBOURS, GroundReference, Slopes, choose_radius, measure_reference
 from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.render import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine, trace_rays
