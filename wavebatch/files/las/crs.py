@@ -106,7 +106,7 @@ class GeoKeys:
     def read_units(self) -> tuple[float | None, float | None]:
         """Return metres per unit of x and y, and of z; None where the keys do not say, NaN for an unknown unit.
 
-        If no key gives the unit, the EPSG code of the CRS does (`find_unit`), then a citation that names feet.
+        If no key gives the unit, the EPSG code of the CRS does, then a citation that names feet.
         """
         horizontal, vertical = self._read_unit(_LINEAR), self._read_unit(_VERTICAL)
         if horizontal is None and self.kind != "geographic":
