@@ -9,6 +9,7 @@ import pytest
 from commands import run_command
 from pulse_files import Pulse, PulseFile, Sampling, bell
 
+import wavebatch as wb
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.system_file import load_survey
@@ -104,6 +105,59 @@ def test_energies_and_pulse_are_those_that_were_sent(tmp_path, rng, fwhm):
     shown = run_command("survey", tmp_path / "o.las").output
     width = saved.figures.outgoing_fwhm_ns
     assert f"outgoing pulses   full width at half maximum {width:.3f} ns, as import found it" in shown
+
+
+def _sent(rng, number, height, noise, top=255):
+    """Pulses of energies that vary by a tenth over level ground, each at its phase."""
+    energies = 1 + 0.1 * rng.standard_normal(number)
+    for index, energy in enumerate(energies):
+        late = np.arange(50) - 10 - rng.uniform(-0.5, 0.5)
+        bell = energy * np.exp(-0.5 * (late / 1.7) ** 2)
+        sent = np.clip(np.round(5 + height * bell[:32] + rng.normal(0, noise, 32)), 0, top)
+        echo = np.maximum(np.round(4 + 120 * bell + rng.normal(0, 0.6, 50)), 0)
+        time, x = 400_000_000_000 + 100 * index, 6 * index
+        yield Pulse([[(-1000, sent)], [(2000, echo)]], time, (x, 0, 1_000_000), (x, 0, 1_000_000 - 149_896))
+
+
+def _run(tmp_path, *options):
+    done = run_command("run", tmp_path / "o.las", "-o", tmp_path / "out", *options)
+    assert done.exit_code == 0, done.output
+    return wb.read_cloud(tmp_path / "out" / "o.laz"), done.output
+
+
+def test_clipped_outgoing_pulses_have_a_time_but_no_energy(tmp_path, rng):
+    pulses = list(_sent(rng, 800, 245, 0.5))
+    clipped = np.array([pulse.waves[0][0][1].max() == 255 for pulse in pulses])
+    found = import_file(_make(tmp_path, pulses), tmp_path / "o.las", ImportOptions())
+    assert 250 < np.count_nonzero(clipped) == found.outgoing["unknown"] < 400
+    assert any(note.startswith(f"{np.count_nonzero(clipped)} outgoing pulses are clipped") for note in found.notes)
+    _, points, xyz = _points(tmp_path / "o.las")
+    assert np.array_equal(np.isnan(points["pulse_energy"]), clipped)
+    assert xyz[clipped, 2].std() < 0.006 and abs(xyz[clipped, 2].mean() - xyz[~clipped, 2].mean()) < 0.002
+    # Without a calibration too, what they lack is in the errors and in a line.
+    cloud, said = _run(tmp_path, "--columns", "+amplitude_normalized,+amplitude_normalized_err", "--flight-height", 151)
+    error = cloud["amplitude_normalized_err"] / cloud["amplitude_normalized"]
+    lost = np.isnan(cloud["pulse_energy"])
+    assert "of the pulses have none and count as of mean energy" in said
+    assert np.sqrt(np.median(error[lost]) ** 2 - np.median(error[~lost]) ** 2) > 0.1
+
+
+def test_outgoing_pulses_that_are_cut_have_an_error_that_holds(tmp_path, rng):
+    pulses = list(_sent(rng, 400, 180, 0.5))
+    for pulse in pulses:
+        pulse.waves[0][0] = (-1000, pulse.waves[0][0][1][:13])
+    import_file(_make(tmp_path, pulses), tmp_path / "o.las", ImportOptions())
+    _, points, _ = _points(tmp_path / "o.las")
+    energies = [pulse.waves[1][0][1].max() - 4 for pulse in pulses]
+    off = points["pulse_energy"] - energies / np.mean(energies)
+    assert 0.02 < off.std() < points["pulse_energy_err"].mean()
+
+
+def test_errors_of_ranges_hold_when_a_weak_outgoing_pulse_was_sent(tmp_path, rng):
+    import_file(_make(tmp_path, list(_sent(rng, 500, 15, 1.0))), tmp_path / "o.las", ImportOptions())
+    cloud, _ = _run(tmp_path)
+    off = cloud["z"] - np.median(cloud["z"])
+    assert 0.02 < off.std() < 1.25 * np.median(cloud["range_err"]) < 0.06
 
 
 def test_segments_of_a_pulse_are_returns_in_order(tmp_path):

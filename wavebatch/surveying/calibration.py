@@ -41,6 +41,10 @@ def check_attenuation(value: float) -> None:
         raise ConfigError(f"{problem}; is it per metre? Clear air has 0.1 to 0.5 dB/km")
 
 
+CHANGE_CHANCE = 0.3
+"""Of another energy or gain under the same header, where no calibration says it."""
+
+
 @frozen
 class TargetResult:
     """What one reference target gave; where it gave no constant, `refused` says why."""
@@ -207,7 +211,7 @@ class Calibration:
         float,
         Range(0.0, 0.9),
         Key("change_chance", "assumed: of another energy or gain under the same header; 0: logs exclude it"),
-    ] = 0.3
+    ] = CHANGE_CHANCE
     """Chance that a strip has another energy or gain under the same header, or a laser that fades, before its light is
     seen. Nothing in a strip tells it: it is high, since errors must hold for those who have one."""
     energy_mean: Annotated[

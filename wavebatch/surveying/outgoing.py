@@ -77,7 +77,7 @@ def learn_shape(samples: np.ndarray, spacing: float, reference: OutgoingReferenc
     stacked pulse, until it does not change.
     """
     found = measure_outgoing(samples, reference)
-    good = np.flatnonzero(np.isfinite(found.time) & (samples.max(axis=1) < np.iinfo(samples.dtype).max))
+    good = np.flatnonzero(np.isfinite(found.energy) & (samples.max(axis=1) < np.iinfo(samples.dtype).max))
     if len(good) < ENOUGH_TO_LEARN:
         return None
     signal = samples[good] - found.level[good, None]
@@ -154,7 +154,7 @@ def save_outgoing(
     same_receiver : bool
         Whether the receiver of the echoes recorded them.
     **scatter : float
-        Figures of the shots: energy_scatter, energy_error, width_scatter, all relative.
+        Figures of the shots: energy_scatter, energy_error, width_scatter, all relative, and time_error_ns.
 
     Returns
     -------
@@ -229,7 +229,7 @@ def compare_outgoing(found: Survey, strip: Path) -> Survey:
     rings = f"after-pulses {100 * found.system.ringing:.1f} and {100 * sent.system.ringing:.1f} %"
     text = f"echoes {ours:.3f} ns wide at half maximum, outgoing pulses {theirs:.3f} ns, {rings}: {why}"
     # Not the name of the figure itself: a survey that is saved beside the strip is no file of outgoing pulses.
-    figures = replace(found.figures, sent_fwhm_ns=theirs)
+    figures = replace(found.figures, sent_fwhm_ns=theirs, sent_time_error_ns=sent.figures.outgoing_time_error_ns)
     shape = ("sigma_ref", "components", "kappa", "ringing")
     pulse = {name: getattr(sent.system, name) for name in shape} if take else {}
     system = replace(found.system, **pulse)

@@ -6,12 +6,14 @@ run sees. Before you change it: the result must depend on the strip and the requ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from enum import Enum
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.pulse_energy import NONE
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -125,7 +127,10 @@ def prepare(
     elif "incidence_angle_normals" in choice.chain.makes:  # only to see whether its vectors are turned
         source = _find_sensor(reader, scan, SensorRequest(), Positions.IF_KNOWN)
     system, sent = choice.survey.system, StripEnergies(None)
-    source = replace(source, returns=measure_returns(reader, scan, system))
+    returns, late = measure_returns(reader, scan, system), choice.survey.figures.sent_time_error_ns
+    if late and returns.source != "neighbours":  # within a packet nothing shows when its pulse was sent
+        returns = returns._replace(scatter=math.hypot(returns.scatter, HALF_C * late))
+    source = replace(source, returns=returns)
     if calibration is not None or positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):
         sent = take_energies(reader, scan, energy, calibration)
     if calibration is None:

@@ -38,6 +38,7 @@ from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference, measure_outgoing
 from wavebatch.kernels.signal.signal import find_peaks, smooth_121, transpose_samples
+from wavebatch.surveying.measuring.noise_and_width import find_saturation
 from wavebatch.surveying.outgoing import STACKED, SYSTEM_SUFFIX, OutgoingShape, learn_shape, save_outgoing
 from wavebatch.surveying.system_file import format_survey
 
@@ -85,7 +86,7 @@ class ImportSummary:
     """Segments of other channels that the sensitive one recorded as well, unsaturated."""
     outgoing: dict[str, float] | None = None
     """Of the outgoing pulses: fwhm_ns, energy_scatter, energy_error, width_scatter (relative), and unknown: pulses
-    whose outgoing recording shows no pulse."""
+    whose outgoing recording shows no pulse, or clips it."""
     system_file: str | None = None
     notes: tuple[str, ...] = ()
 
@@ -167,7 +168,7 @@ def import_file(
                 saved = save_outgoing(
                     sent.shape, sent.reference, spacing, bits, path.name, source,
                     same_receiver=channel == plan.primary, energy_scatter=sent.scatter, energy_error=sent.error,
-                    width_scatter=sent.width_scatter,
+                    width_scatter=sent.width_scatter, time_error_ns=sent.time_error,
                 )  # fmt: skip
                 draft = Draft(writer.target.with_suffix(SYSTEM_SUFFIX), overwrite=overwrite)
                 writer.drafts.insert(0, draft)
@@ -194,9 +195,11 @@ def import_file(
         )
     if counts.without_returns:
         notes.append(f"{counts.without_returns} pulses have no returning segment, and so no point")
+    if counts.outgoing and counts.outgoing["unknown"]:
+        notes.append(f"{counts.outgoing['unknown']} outgoing pulses are clipped or not seen: their energy is not known")
     kinds = {s.kind for one in header.descriptors.values() for s in one.samplings}
     if plan.outgoing is None and kinds - {RETURNING}:
-        notes.append("its recordings of outgoing pulses show no pulse")
+        notes.append("its recordings of outgoing pulses show no pulse, or are clipped")
     counts.notes = (*frame.notes, *notes)
     return counts
 
@@ -231,6 +234,8 @@ class Outgoing:
     """The same of energy over amplitude: how much the width of pulses varies, relative."""
     origin: float
     """Mean time of their peaks on the clock of the pulses [samples]."""
+    time_error: float
+    """Root mean square error of these times [ns]."""
 
 
 @frozen(eq=False)
@@ -330,13 +335,14 @@ def _learn_outgoing(samples: dict[int, list[tuple[np.ndarray, np.ndarray]]]) -> 
     reference = find_reference(values)
     if reference is None:
         return None
+    _, bits, spacing, _ = decode(code)
+    reference = reference._replace(top=find_saturation(values, (1 << bits) - 1) or np.inf)
     pulses = measure_outgoing(values, reference)
     good = np.isfinite(pulses.energy)
     if np.count_nonzero(good) < 2:
         return None
     energy, amplitude = pulses.energy[good], pulses.amplitude[good]
     error = float((pulses.energy_error[good] / energy).mean())
-    _, _, spacing, _ = decode(code)
     shape_error = float(np.hypot(error, (pulses.amplitude_error[good] / amplitude).mean()))
     # Relative scatter of energies and shapes beyond their relative errors.
     beyond = [float(np.sqrt(max((values.std() / values.mean()) ** 2 - own**2, 0.0)))
@@ -344,6 +350,7 @@ def _learn_outgoing(samples: dict[int, list[tuple[np.ndarray, np.ndarray]]]) -> 
     return Outgoing(
         code & ~((1 << 18) - 1), reference, learn_shape(values, spacing, reference), float(energy.mean()),
         float(amplitude.mean()), beyond[0], error, beyond[1], float((start + pulses.time)[good].mean()),
+        spacing * float(np.sqrt(np.mean(pulses.time_error[good] ** 2))),
     )  # fmt: skip
 
 

@@ -43,10 +43,12 @@ class OutgoingReference(NamedTuple):
     """Mean level without light [count]."""
     spread: float
     """Standard deviation of true levels between shots [count]."""
+    top: float = np.inf
+    """Count at which recordings are clipped."""
 
 
 class OutgoingPulses(NamedTuple):
-    """Measures of n outgoing pulses; NaN where a recording shows none."""
+    """Measures of n outgoing pulses; NaN where a recording shows none, or all but the time where it is clipped."""
 
     energy: np.ndarray
     """Sum above the level, f8 (n,) [count samples]."""
@@ -60,6 +62,8 @@ class OutgoingPulses(NamedTuple):
     """Standard deviation, f8 (n,)."""
     amplitude_error: np.ndarray
     """Standard deviation, f8 (n,)."""
+    time_error: np.ndarray
+    """Standard deviation, f8 (n,) [samples]."""
 
 
 def find_reference(samples: np.ndarray) -> OutgoingReference | None:
@@ -129,10 +133,12 @@ def measure_outgoing(samples: np.ndarray, reference: OutgoingReference) -> Outgo
     -----
     The height is that of a parabola through the logarithms of the three largest samples, which is exact for a
     Gaussian. The energy is the sum from BEFORE widths before the peak to AFTER widths behind it; samples at the ends
-    count in part, so that the sum does not depend on where the peak lies between two samples.
+    count in part, so that the sum does not depend on where the peak lies between two samples. What a recording cuts off
+    is as much as half a width of its last sample, which is in the error.
     """
     values = samples.astype(np.float32)
     n, s = values.shape
+    clipped = (values >= reference.top).any(axis=1)
     rows, place = np.arange(n), np.arange(s, dtype=np.float32)
     peak = np.clip(np.argmax(values, axis=1), 1, max(s - 2, 1)) if s > 2 else np.zeros(n, int)
     # Quiet samples of each shot, drawn to the level of all shots.
@@ -150,15 +156,26 @@ def measure_outgoing(samples: np.ndarray, reference: OutgoingReference) -> Outgo
     shift = np.where(bend < 0, 0.5 * (low - high) / np.minimum(bend, -1e-9), 0.0)
     shift = np.clip(shift, -1.0, 1.0)
     amplitude = exp(top - 0.25 * (low - high) * shift)
-    time = peak + shift
+    # Of what is clipped the largest sample is the first: its middle, between the places of half its height, counts.
+    half = 0.5 * values.max(axis=1)
+    sides = []
+    for mirrored in (values, values[:, ::-1]):
+        first = np.maximum(np.argmax(mirrored > half[:, None], axis=1), 1)
+        step = np.maximum(mirrored[rows, first] - mirrored[rows, first - 1], 1e-6)
+        sides.append(first - (mirrored[rows, first] - half) / step)
+    time = np.where(clipped, 0.5 * (sides[0] + (s - 1) - sides[1]), peak + shift)
     lag = place - time.astype(np.float32)[:, None]
     weight = np.clip(lag + np.float32(BEFORE * reference.width + 0.5), 0, 1)
     weight *= np.clip(np.float32(AFTER * reference.width + 0.5) - lag, 0, 1)
     energy = (values * weight).sum(axis=1, dtype=np.float64)
     total = weight.sum(axis=1, dtype=np.float64)
     squares = (weight * weight).sum(axis=1, dtype=np.float64)
-    energy_error = np.sqrt(reference.noise**2 * reference.gain * squares + variance * total**2)
+    cut = 0.5 * reference.width * np.maximum(values[:, -1], 0.0)
+    energy_error = np.sqrt(reference.noise**2 * reference.gain * squares + variance * total**2 + cut**2)
+    # Of the parabola: half of the variance by the samples beside the peak, half by its bend where it lies between two.
+    time_error = reference.width**2 * reference.noise / amplitude
     amplitude_error = np.sqrt((PEAK_ERROR * reference.noise) ** 2 + variance)
     seen = (amplitude > LEAST_HEIGHT * reference.noise) & (energy > 0)
-    measures = (energy, amplitude, time, level, energy_error, amplitude_error)
-    return OutgoingPulses(*(np.where(seen, measure, np.nan) for measure in measures))
+    measures = (energy, amplitude, time, level, energy_error, amplitude_error, time_error)
+    known = OutgoingPulses(*(np.where(seen & ~clipped, measure, np.nan) for measure in measures))
+    return known._replace(time=np.where(seen, time, np.nan))

@@ -18,7 +18,7 @@ from wavebatch.core.order import even_places
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
-from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.calibration import CHANGE_CHANCE, Calibration
 from wavebatch.surveying.matching.setting import (
     LIKELY,
     QUANTILES,
@@ -125,7 +125,7 @@ def take_energies(
                 f"the error of the constant grows by {100 * growth:.1f} %"
             )
     elif energy is not None and energy.known < 1.0:
-        chance = Calibration.change_chance if calibration is None else calibration.change_chance
+        chance = CHANGE_CHANCE if calibration is None else calibration.change_chance
         places = _read_places(reader, scan, replace(energy, fills=None))
         more = _compare_unknown(np.concatenate([np.empty((4, 0)), *places], axis=1), chance)
         energy = replace(energy, fills=math.hypot(energy.fills or 0.0, more))

@@ -120,6 +120,8 @@ class Figures:
     descriptors_pooled: Figure = None
     sent_fwhm_ns: Figure = None
     """Of the outgoing pulses that the strip's pulse was compared with."""
+    sent_time_error_ns: Figure = None
+    """Of their times, which echoes are placed by: standard deviation."""
     look: Annotated[Look | None, Key("flight_")] = None
     """What the surveyed strips record: other strips of the sensor are compared with it."""
     kinds: Annotated[Mapping[int, Kind], Key("flight_descriptor_{}_")] = field(default_factory=dict)
@@ -132,6 +134,7 @@ class Figures:
     """From shot to shot, relative; so are the next two."""
     outgoing_energy_error: Figure = None
     outgoing_width_scatter: Figure = None
+    outgoing_time_error_ns: Figure = None
 
     @property
     def samples(self) -> str:
