@@ -164,9 +164,14 @@ def shape_limits(
     """
     shape = pulse_shape(system, spacing)
     ref = (system.components[0][2] if shape.components else system.sigma_ref) / spacing
-    narrowest = min((extra for _, _, extra in shape.components), default=0.0)
-    positive = float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))
+    positive = _narrowest(shape, ref)
     return ShapeLimits(ref, max(least * ref, positive), max(most * ref, positive))
+
+
+def _narrowest(shape: PulseShape, ref: float) -> float:
+    """The least width of which every component has one."""
+    narrowest = min((extra for _, _, extra in shape.components), default=0.0)
+    return float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))
 
 
 def _find_delay(shape: PulseShape, ref: float, width: np.ndarray) -> tuple[np.ndarray | float, np.ndarray | float]:
@@ -193,12 +198,16 @@ def _is_symmetric(shape: PulseShape) -> bool:
     return not shape.components and shape.table is None and abs(shape.kappa) < NO_SKEW
 
 
-def _table(shape: PulseShape, limits: ShapeLimits, *, wide: bool = False) -> PulseMeasures:
-    """The table of the usual widths, or of all widths above: one of both would be too coarse for the usual ones."""
+def _usual(shape: PulseShape, limits: ShapeLimits) -> tuple[float, float]:
+    """Ends of the table of usual widths: one for all fits that allow no narrower ones, since it takes long."""
+    low = min(limits.low, max(LEAST_WIDTH * limits.ref, _narrowest(shape, limits.ref)))
+    return low, min(limits.high, max(MOST_WIDTH * limits.ref, 1.01 * limits.low))
+
+
+def _wide(limits: ShapeLimits) -> tuple[float, float]:
+    """Those of the table of all widths above: one of both would be too coarse for the usual ones."""
     usual = max(MOST_WIDTH * limits.ref, 1.01 * limits.low)
-    if wide:
-        return measure_pulse(shape, usual, max(BROADEST * limits.ref, 1.01 * usual))
-    return measure_pulse(shape, limits.low, min(limits.high, usual))
+    return usual, max(BROADEST * limits.ref, 1.01 * usual)
 
 
 @lru_cache(maxsize=16)
@@ -289,11 +298,10 @@ def _factors_at(
 
     The second row are those by a level that is wrong by the noise of a sample.
     """
-    joint = _pulse_rows(shape, width)
-    bare = np.eye(joint.shape[1])
+    joint = seen = _pulse_rows(shape, width)
     if whitening:
-        bare = np.stack([np.convolve(row, whitening_filter(whitening)[2]) for row in bare])
-    seen = np.einsum("is,sf->if", joint, bare)
+        bare = np.stack([np.convolve(row, whitening_filter(whitening)[2]) for row in np.eye(joint.shape[1])])
+        seen = np.einsum("is,sf->if", joint, bare)
     main = solve(np.einsum("if,jf->ij", seen, seen), seen)
     # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
     main = np.concatenate([main, main[:1] + main[2:]])
@@ -301,12 +309,11 @@ def _factors_at(
     whole[1] += _find_delay(shape, limits.ref, np.full(1, width))[1] * main[2]
     if shape.components:
         # The peak of a pulse of amplitude 1, and its slope by the width.
-        measures = measure_pulse(shape, limits.low, limits.high)
-        slopes = np.gradient(measures.peak, measures.width)
-        peak, by_peak = (np.interp(np.array(width), measures.width, values) for values in (measures.peak, slopes))
+        table = _rows(shape, limits.low, limits.high)
+        peak, by_peak = (np.interp(np.array(width), table[:, 0], values) for values in (table[:, 1], table[:, 2]))
         whole[0] += by_peak / peak * width * main[2]
     given = np.einsum("is,is->i", whole, whole)
-    weights = np.einsum("if,sf->is", whole, bare)
+    weights = np.einsum("if,sf->is", whole, bare) if whitening else whole
     variance = coloured_variance(weights, correlation)
     return np.stack([np.sqrt(np.maximum(variance / given, LEAST_FACTOR)), weights.sum(axis=1) / np.sqrt(given)])
 
@@ -359,13 +366,15 @@ def whole_pulse(shape: PulseShape, limits: ShapeLimits, widths: np.ndarray) -> W
         return WholePulse()
     if not shape.components:
         return WholePulse(STRETCHED, datum=_unit_datum(shape), ref=limits.ref, least=LEAST_WIDTH)
-    near = _table(shape, limits)
-    wide = _rows(_table(shape, limits, wide=True)) if (widths > near.width[-1]).any() else NO_ROWS
-    return WholePulse(SUMMED, _rows(near), wide, datum=matched_gaussian(shape, limits.ref)[0])
+    near = _rows(shape, *_usual(shape, limits))
+    wide = _rows(shape, *_wide(limits)) if (widths > near[-1, 0]).any() else NO_ROWS
+    return WholePulse(SUMMED, near, wide, datum=matched_gaussian(shape, limits.ref)[0])
 
 
-def _rows(table: PulseMeasures) -> np.ndarray:
+@lru_cache(maxsize=16)
+def _rows(shape: PulseShape, low: float, high: float) -> np.ndarray:
     """Width, peak and its slope, sigma and its slope, float64 (k, 5)."""
+    table = measure_pulse(shape, low, high)
     sigma = table.half_width / FWHM_PER_SIGMA
     steep = np.gradient(sigma, table.width)
     return np.stack([table.width, table.peak, np.gradient(table.peak, table.width), sigma, steep], axis=1)
@@ -392,11 +401,11 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
         return echoes
     inner = echoes.copy()
     if shape.components:
-        near = _table(shape, limits)
+        near = measure_pulse(shape, *_usual(shape, limits))
         inner = _invert(near, echoes)
         beyond = echoes[:, 2] * FWHM_PER_SIGMA > near.half_width[-1] * (1 + 1e-5)
         if limits.high > near.width[-1] and beyond.any():
-            inner[beyond] = _invert(_table(shape, limits, wide=True), echoes[beyond])
+            inner[beyond] = _invert(measure_pulse(shape, *_wide(limits)), echoes[beyond])
     inner[:, 1] -= _find_delay(shape, limits.ref, inner[:, 2])[0]
     return inner
 
