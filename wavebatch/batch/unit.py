@@ -344,6 +344,7 @@ def solve_unit(
             if prepared.pulse_energy is not None:
                 placed = prepared.pulse_energy.fill(placed, unit)
             solved.append((index, prepared.job.chain.solve(placed, system, timing).without_samples()))
+            del found, block, placed  # else its samples would stay while the next one is read, and the rows are made
     start = Seconds.now()
     solved = _mark_edges(prepared, solved)
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
