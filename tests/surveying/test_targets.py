@@ -105,6 +105,9 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     targets.write_text(f"reflectance,x,y,radius\n0.2,{x},{y + 30},20\n0.5,{x},{y - 30},20\n")
     done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "two.toml")
     assert done.exit_code == 0 and "warning: constants of the targets differ by a factor of 2." in done.stderr
+    targets.write_text(f"name,reflectance,x,y,radius\nnear,0.002,{x},{y},40\n")  # 100 times too small
+    done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "dark.toml")
+    assert done.exit_code == 0 and "near: no dry surface has a reflectance of 0.002" in done.stderr
 
 
 def test_targets_off_the_strip(tmp_path, ground):

@@ -161,6 +161,10 @@ MOST_PARTS, MOST_APART = 8, 0.1
 """Parts of a target in each direction, of LEAST_ECHOES echoes or more; and scatter of their constants, beyond what that
 of the echoes explains, from which it is of several surfaces, which is in the error: tarps and asphalt have 1 to 3 %."""
 
+DARKEST = 0.01
+"""Reflectance of a target from which it is named: black paint and wet asphalt have 0.03 and more, so that less is
+another unit, such as a hundredth of a share. Ten times too little looks like a dark surface."""
+
 MOST_CLIPPED = 0.2
 """Share of clipped echoes from which a target is refused: the others are the dim ones, by a third of their scatter."""
 
@@ -593,6 +597,11 @@ def _list_doubts(
     """What a person should look at before the calibration is used."""
     yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
+        if result.reflectance < DARKEST and not options.column:
+            yield (
+                f"{result.name}: no dry surface has a reflectance of {result.reflectance:g}, and all results are in "
+                "proportion to it: it is a share of 1"
+            )
         if result.apart > MOST_APART:
             which, why = "parts", "several surfaces? Check its outline"
             if options.column:
