@@ -398,7 +398,8 @@ def test_a_pulse_is_chosen_where_no_echo_stands_clear():
     """All clear echoes were near the digitizer's limit, and the test of wide ones had none left."""
     block = WaveformBlock.from_samples(np.full((40, 60), 12, np.uint8))
     one, other = SystemPulse(2.0, kappa=0.1), SystemPulse(2.0, components=((0.1, 3.0, 1.0),))
-    assert learn_pulse._fit_wide_best(block, one, (one, other)) is one
+    clear = learn_pulse.find_clear(block, one)
+    assert learn_pulse._fit_wide_best(block, one, clear, (one, other)) is one
 
 
 def skewed(widening=0.0, skew=0.25):

@@ -118,7 +118,7 @@ def _align(
 def _describe(stack: Stack, fit: PulseFit, spacing: float, pulses: int) -> OutgoingShape:
     """Width and after-pulses of a fit."""
     lag = np.linspace(stack.lag[0], stack.lag[-1], _GRID) - fit.datum
-    value = sum(weight * exp(-0.5 * ((lag - delay) / sigma) ** 2) for weight, delay, sigma in fit.components)
+    value = fit.draw(lag + fit.datum)
     top = int(np.argmax(value))
     low = value < 0.5 * value[top]
     left, right = lag[top - int(np.argmax(low[top::-1]))], lag[top + int(np.argmax(low[top:]))]

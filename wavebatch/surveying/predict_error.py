@@ -19,17 +19,15 @@ from wavebatch.core.no_data import without_nan
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import bound_time
-from wavebatch.kernels.fit.describe import render_pulses
 from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.decompose.merge import excess_variance
 from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.noise_and_width import FEW
-from wavebatch.surveying.measuring.residuals import decompose_sample
+from wavebatch.surveying.measuring.residuals import decompose_sample, render_own
 
 WAVEFORMS = 2048
 """Waveforms of a trial."""
@@ -156,10 +154,7 @@ def simulate_again(
         Without the defects of the strip's waveforms: simulated ones have none.
     """
     n, s = len(block), length or block.samples.shape[1]
-    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
-    start = [echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing]
-    main = model_parameters(shape, limits, np.stack(start, axis=1).astype(np.float64))
-    signal = render_pulses(shape, n, s, echoes.waveform, main)
+    signal = render_own(block, system, echoes, echoes.waveform, n, s)
     # Rounding to whole counts, below, adds this part of the noise again.
     white = max(system.noise.std**2 - QUANTISATION_STD**2, 0.0)
     variance = white + system.noise.gain * np.maximum(signal, 0)

@@ -234,7 +234,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.isolated_echoes = len(main)
         starts = {"gaussian": system}
         if len(main) >= ENOUGH_TO_LEARN:
-            starts["lone echoes"] = learn_pulse(block, system, main, figures)
+            starts["lone echoes"] = learn_pulse(block, system, clear, main, figures)
         else:
             guess = guess_width(block, system)
             starts |= {} if guess is None else {"single echoes": guess}

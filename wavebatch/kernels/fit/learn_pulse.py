@@ -117,6 +117,16 @@ class PulseFit(NamedTuple):
     datum: float
     """Delay of the strongest component (or the skewed pulse's peak) in the stack [samples]."""
 
+    def draw(self, lag: np.ndarray) -> np.ndarray:
+        """Return the pulse at lags (b,) of its stack, of height 1."""
+        weight, delay, sigma = self.components.T
+        if self.kappa:
+            at = np.array([self.datum])
+            drawn = evaluate_pulse(PulseShape(kappa=self.kappa), lag[:, None], at, sigma[:1])[0][:, 0]
+        else:
+            drawn = np.einsum("lc,c->l", exp(-0.5 * ((lag[:, None] - self.datum - delay) / sigma) ** 2), weight)
+        return drawn / drawn.max()
+
 
 def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0) -> list[PulseFit]:
     """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more.

@@ -6,18 +6,16 @@ where the alternation begins, nor have the scene in its tail.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import gather_pulse
-from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, refine_gaussians
-from wavebatch.kernels.fit.pulse_shape import measure_pulse
-from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
+from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, Stack, fit_gaussians, refine_gaussians
+from wavebatch.stages.pulse_tables import shape_limits
 from wavebatch.surveying.measuring.judge import Explained, find_own_width, sample_noise
+from wavebatch.surveying.measuring.learn_pulse import with_fit
 
 BEFORE, CORE, AFTER = 5.0, 4.0, 40.0
 """Widths of the pulse before its peak where it may begin; after it up to which it is drawn in fine steps; and at which
@@ -92,22 +90,13 @@ def learn_jointly(
         fits = [refine_gaussians(stack, np.array(system.components) / [1, spacing, spacing])]
     else:
         fits = fit_gaussians(stack, width, MOST_COMPONENTS if last else 3, 0.0)
-    missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
+    missed = [float(np.mean((fit.draw(stack.lag) - stack.value) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
     # As the kernel counts it: root of the energy that is left over that of a Gaussian of this width.
-    left = _miss(best, stack)[core]
+    left = (best.draw(stack.lag) - stack.value)[core]
     misfit = float(np.sqrt(np.sum(left * left) * (STEP * system.sigma_ref / spacing) / (SQRT_PI * width)))
-    system = replace(system, kappa=0.0, components=(), ringing=0.0, misfit=misfit)
-    if len(best.components) == 1:
-        return replace(system, sigma_ref=float(best.components[0, 2]) * spacing)
-    far = np.abs(stack.lag - best.datum) > 4 * width
-    components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in best.components)
-    system = replace(system, components=components, ringing=float(np.abs(stack.value[far]).max(initial=0.0)))
-    limits = shape_limits(system, spacing)
-    table = measure_pulse(pulse_shape(system, spacing), limits.low, limits.high)
-    full = float(np.interp(limits.ref, table.width, table.half_width))
-    return replace(system, sigma_ref=full / FWHM_PER_SIGMA * spacing)
+    return with_fit(system, best, stack, width, spacing, misfit)
 
 
 def count_telling(explained: Explained) -> int:
@@ -159,10 +148,3 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     error = np.sqrt(np.maximum(np.einsum("lk,kj,lj->l", rows, inverse[:-1, :-1], rows), 0.0))
     top = max(float(value.max()), 1e-30)
     return Stack(lag, value / top, np.maximum(error / top, LEAST_ERROR))
-
-
-def _miss(fit: PulseFit, stack: Stack) -> np.ndarray:
-    """What a sum of Gaussians leaves of the pulse at each lag, over its height."""
-    weight, delay, sigma = fit.components.T
-    drawn = np.einsum("lc,c->l", exp(-0.5 * ((stack.lag[:, None] - fit.datum - delay) / sigma) ** 2), weight)
-    return drawn / drawn.max() - stack.value

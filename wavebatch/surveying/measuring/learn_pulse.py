@@ -9,9 +9,9 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import exp, log
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
-from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse, measure_pulse
+from wavebatch.kernels.fit.pulse_shape import measure_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import floor_level, pulse_shape, shape_limits
@@ -105,7 +105,9 @@ def find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     return echoes.take(np.flatnonzero((echoes.amplitude > 0.08 * bright) & (echoes.amplitude < top)))
 
 
-def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: Figures) -> SystemPulse:
+def learn_pulse(
+    block: WaveformBlock, system: SystemPulse, clear: EchoTable, main: EchoTable, figures: Figures
+) -> SystemPulse:
     """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
     noise = pooled_noise(block, system)
     signal = block.samples[main.waveform] - noise.level[main.waveform]
@@ -136,19 +138,20 @@ def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figu
     chosen = _with_pulse(system, best, stack, block.spacing)
     if best.kappa and len(sums) > 1:
         # The same pulse on level ground, so that widened echoes alone decide.
-        drawn = stack._replace(value=_draw(best, stack.lag), error=np.full(len(stack.lag), 1.0))
+        drawn = stack._replace(value=best.draw(stack.lag), error=np.full(len(stack.lag), 1.0))
         other = fit_gaussians(drawn, width)[-1]
-        return _fit_wide_best(block, system, (chosen, _with_pulse(system, other, stack, block.spacing)))
+        return _fit_wide_best(block, system, clear, (chosen, _with_pulse(system, other, stack, block.spacing)))
     return chosen
 
 
-def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[SystemPulse, SystemPulse]) -> SystemPulse:
+def _fit_wide_best(
+    block: WaveformBlock, system: SystemPulse, clear: EchoTable, pulses: tuple[SystemPulse, SystemPulse]
+) -> SystemPulse:
     """The first of two pulses that fit level ground equally well, unless the other fits widened echoes better.
 
     A target that widens a skewed pulse stretches it as a whole; a sum of Gaussians grows round. Only the strongest
     echoes of slopes and plants show which of them is right.
     """
-    clear = find_clear(block, system)
     top = system.saturation or float(block.samples.max())
     clear = clear.take(np.flatnonzero(clear.amplitude < FAR_FROM_LIMIT * top))
     if not len(clear):
@@ -174,46 +177,40 @@ CORE = 4.0
 """Widths of the pulse around its peak in which its misfit counts."""
 
 
-def _draw(fit: PulseFit, lag: np.ndarray) -> np.ndarray:
-    """The pulse of a fit at the lags of its stack, of height 1."""
-    weight, delay, sigma = fit.components.T
-    if fit.kappa:
-        at = np.array([fit.datum])
-        drawn = evaluate_pulse(PulseShape(kappa=fit.kappa), lag[:, None], at, sigma[:1])[0][:, 0]
-    else:
-        z = (lag[:, None] - fit.datum - delay) / sigma
-        drawn = np.einsum("lc,c->l", exp(-0.5 * z * z), weight)
-    return drawn / drawn.max()
-
-
 def _draw_scaled(fit: PulseFit, stack: Stack) -> np.ndarray:
     """The pulse of a fit at the height of the stack: those of its echoes are of Gaussians, which few pulses are."""
-    drawn = _draw(fit, stack.lag)
+    drawn = fit.draw(stack.lag)
     return drawn * np.einsum("l,l->", drawn, stack.value) / np.einsum("l,l->", drawn, drawn)
 
 
 def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float) -> SystemPulse:
-    """The system with a learned pulse in ns; its ringing is the largest value beyond 4 widths.
+    """The system with the pulse that lone echoes show.
 
     A Gaussian keeps the width that the echoes themselves had: aligning them for the stack widens it a little.
     """
     width = system.sigma_ref / spacing
-    far = np.abs(stack.lag - fit.datum) > 4 * width
-    ringing = float(np.abs(stack.value[far]).max(initial=0.0))
     # What the model misses of the stack's core beyond chance, in the kernel's terms: its energy over
     # that of a Gaussian. Further out are neighbours.
     core = np.abs(stack.lag - fit.datum) < CORE * width
     rest = _draw_scaled(fit, stack) - stack.value
     missed = max(float(np.mean(rest[core] ** 2 - stack.error[core] ** 2)), 0.0)
     misfit = float(np.sqrt(missed * 2 * CORE / SQRT_PI))
-    system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
-    if len(fit.components) > 1:
-        components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
-        system = replace(system, components=components)
-        limits = shape_limits(system, spacing)
-        table = measure_pulse(pulse_shape(system, spacing), limits.low, limits.high)
-        half_width = float(np.interp(limits.ref, table.width, table.half_width))
-        return replace(system, sigma_ref=half_width / FWHM_PER_SIGMA * spacing)
-    if fit.kappa:
-        return replace(system, sigma_ref=float(fit.components[0, 2]) * spacing)
-    return system
+    found = with_fit(system, fit, stack, width, spacing, misfit)
+    return found if found.components or found.kappa else replace(found, sigma_ref=system.sigma_ref)
+
+
+def with_fit(
+    system: SystemPulse, fit: PulseFit, stack: Stack, width: float, spacing: float, misfit: float
+) -> SystemPulse:
+    """Return the system with the pulse of a fit, in ns; its ringing is what the stack has beyond 4 widths [samples]."""
+    far = np.abs(stack.lag - fit.datum) > 4 * width
+    ringing = float(np.abs(stack.value[far]).max(initial=0.0))
+    scaled = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
+    components = scaled if len(scaled) > 1 else ()
+    system = replace(system, ringing=ringing, kappa=fit.kappa, components=components, misfit=misfit)
+    if not components:
+        return replace(system, sigma_ref=scaled[0][2])
+    limits = shape_limits(system, spacing)
+    table = measure_pulse(pulse_shape(system, spacing), limits.low, limits.high)
+    half_width = float(np.interp(limits.ref, table.width, table.half_width))
+    return replace(system, sigma_ref=half_width / FWHM_PER_SIGMA * spacing)

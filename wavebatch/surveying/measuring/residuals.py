@@ -119,14 +119,14 @@ def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable
 
 
 def render_own(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rows: np.ndarray, number: int
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rows: np.ndarray, number: int, length: int = 0
 ) -> np.ndarray:
-    """Models of echoes (m,) added up in `number` rows of the block's length; rows: which row each echo goes to."""
+    """Models of echoes (m,) added up in `number` rows of a length, else the block's; rows: the row of each echo."""
     spacing = block.spacing
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
     main = model_parameters(shape, limits, whole)
-    return render_pulses(shape, number, block.samples.shape[1], rows, main)
+    return render_pulses(shape, number, length or block.samples.shape[1], rows, main)
 
 
 def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
