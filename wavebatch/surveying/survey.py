@@ -13,6 +13,7 @@ from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.defects import find_seam
 from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
+from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
 from wavebatch.surveying.measuring.choose_pulse import bear, choose_pulse, settle
@@ -51,14 +52,15 @@ from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import (
-    find_lone,
-    find_ringing,
     guess_width,
     list_known,
     share_repeated,
 )
 from wavebatch.surveying.systems.skew import measure_skew
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
+
+LEAST_RINGING = 0.01
+"""Share of an echo from which what a Gaussian leaves after each one is an after-pulse, whose echoes get a flag."""
 
 NARROWER = 0.85
 """Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
@@ -261,8 +263,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         tailed = measure_tail(block, system, clear)
         system = find_parts(part, tailed, echoes)
         repeated = sorted(set(system.tail_misfit) - set(tailed.tail_misfit))
-        if not (system.components or system.kappa):
-            system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
+        if not (system.components or system.kappa):  # a plain Gaussian: what it leaves after each echo
+            tail = (share for lag, share in system.tail_misfit if 0 < lag <= RINGING_REACH * system.sigma_ref)
+            system = replace(system, ringing=max((share for share in tail if share >= LEAST_RINGING), default=0.0))
         system = choose_whitening(part, system, choice.best.change)
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
         system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)

@@ -20,15 +20,14 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import StripWarning
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import robust_std
-from wavebatch.core.units import FWHM_PER_SIGMA, MEDIAN_ERROR
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
 from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.flags import RINGING_REACH, list_neighbours
+from wavebatch.stages.flags import list_neighbours
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import FEW, HALVED, find_strongest, fit_lone
@@ -59,14 +58,8 @@ ALIKE = 0.05
 NOT_A_GAUSSIAN = 0.5
 """... and over that of the known pulse to its best Gaussian: else every Gaussian of this width would look like it."""
 
-LEAST_RINGING, RINGING_ERRORS = 0.01, 4.0
-"""Least share of an echo, and least number of standard errors, of an after-pulse that echoes show together."""
-
 NO_FIT = 1e6
 """Misfit of an echo to which the pulse cannot be fitted."""
-
-LARGEST_RINGING = 0.12
-"""Largest share of an echo that is taken for an after-pulse where no pulse is known: what is higher is a target."""
 
 
 @frozen
@@ -157,30 +150,6 @@ def guess_width(block: WaveformBlock, system: SystemPulse) -> SystemPulse | None
     width = min(low + 0.674 * float(np.median(lone.sigma_err)), middle)
     # Not below half a sample, as for isolated echoes: spikes are no pulses.
     return replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
-
-
-def find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> float:
-    """Largest after-pulse that echoes show together at one lag, as a share of them; 0 where there is none.
-
-    Second targets are at another distance in every waveform, an after-pulse is not: the median shows it alone. Its
-    height is that which a tenth of the echoes exceed, so that noise does not lift most after-pulses over the limit.
-    """
-    if len(lone) < LEAST_ECHOES:
-        return 0.0
-    _, left, lag = fit_alone(block, system, lone)
-    largest = 0.0
-    for place in np.arange(2.5, RINGING_REACH, 0.5):
-        near = np.abs(lag / system.sigma_ref - place) < 0.5
-        here = np.where(near & np.isfinite(left), left, np.nan)
-        rows = np.isfinite(here).any(axis=1)
-        if rows.sum() < LEAST_ECHOES:
-            continue
-        value = np.nanmean(here[rows], axis=1)
-        middle = float(np.median(value))
-        error = MEDIAN_ERROR * robust_std(value) / np.sqrt(len(value))
-        if middle > max(LEAST_RINGING, RINGING_ERRORS * error):
-            largest = max(largest, float(np.quantile(value, 0.9)))
-    return min(largest, LARGEST_RINGING)
 
 
 def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
