@@ -5,6 +5,7 @@ Growth and detection ask more of an echo beside a strong one by these figures (d
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -361,12 +362,15 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     strong = strong.take(np.arange(0, len(strong), max(len(strong) // ADDED, 1)))
     if len(strong) < FEW:
         return system
-    lags, offs = [np.empty(0)], [np.empty(0)]
-    for turn in range(MOST_TURNS):
-        found = _add_beside(block, system, echoes, strong, turn)
-        lags, offs = [*lags, found[0]], [*offs, found[1]]
-        if sum(map(len, lags)) >= 2 * ADDED:
-            break
+    lags, offs, turn, number = [np.empty(0)], [np.empty(0)], 0, 0
+    while turn < MOST_TURNS and number < 2 * ADDED:
+        # As many turns together as are missing, if the next ones are like those before: a call takes as long as 50 do.
+        missing = (2 * ADDED - number) / max(number / turn if turn else 2 * len(strong), 1)
+        turns = range(turn, min(turn + int(np.ceil(missing)), MOST_TURNS))
+        for lag, off in _add_beside(block, system, echoes, strong, turns):
+            if number < 2 * ADDED:
+                lags, offs, number = [*lags, lag], [*offs, off], number + len(lag)
+        turn = turns.stop
     lag, off = np.concatenate(lags), np.concatenate(offs)
     profile = []
     for place in range(-BESIDE, BESIDE + 1):
@@ -378,20 +382,29 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
 
 
 def _add_beside(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, strong: EchoTable, turn: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lags of echoes that were added and found [widths], and how far their times and amplitudes are off [errors]."""
-    rng = np.random.default_rng(turn)
-    block, ref = block.rows(strong.waveform), system.sigma_ref
-    n, s = block.samples.shape
-    lag = rng.choice([-1, 1], n) * rng.uniform(NOT_ABSORBED - 1, BESIDE + 1, n)
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, strong: EchoTable, turns: range
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Lags of echoes that were added and found [widths], and how far their times and amplitudes are off [errors].
+
+    For each turn, in which every strong echo gets another neighbour.
+    """
+    ref, each = system.sigma_ref, len(strong)
     low, high = log(np.array(HEIGHTS)).tolist()
-    height = system.noise.std * exp(rng.uniform(low, high, n))
-    added = EchoTable.build(np.arange(n), strong.time + lag * ref, height, np.full(n, ref))
+    drawn_by_turn = []
+    for turn in turns:
+        rng = np.random.default_rng(turn)
+        lag = rng.choice([-1, 1], each) * rng.uniform(NOT_ABSORBED - 1, BESIDE + 1, each)
+        drawn_by_turn.append((lag, rng.uniform(low, high, each)))
+    lag, height = (np.concatenate(values) for values in zip(*drawn_by_turn, strict=True))
+    height = system.noise.std * exp(height)
+    block = block.rows(np.tile(strong.waveform, len(turns)))
+    n, s = block.samples.shape
+    added = EchoTable.build(np.arange(n), np.tile(strong.time, len(turns)) + lag * ref, height, np.full(n, ref))
     owner = np.full(int(max(echoes.waveform.max(), strong.waveform.max())) + 1, -1)
-    owner[strong.waveform] = np.arange(n)
+    owner[strong.waveform] = np.arange(each)
     here = echoes.take(np.flatnonzero(owner[echoes.waveform] >= 0))
     here = replace(here, waveform=owner[here.waveform].astype(here.waveform.dtype))
+    here = EchoTable.concatenate((here, turn * each) for turn in range(len(turns)))
     # The strong one itself is so near at most; any other is nearer than a fit takes apart from the one that is added.
     crowded = match_echoes(here, added, (NOT_ABSORBED - 1) * ref).truth
     place = np.rint(added.time / block.spacing).astype(np.int64)
@@ -408,4 +421,7 @@ def _add_beside(
     pair = match_echoes(found, added, ref)
     found, truth = found.take(pair.found), added.take(pair.truth)
     late, high = (found.time - truth.time) / found.time_err, (found.amplitude - truth.amplitude) / found.amplitude_err
-    return np.tile(lag[rows][pair.truth], 2), np.concatenate([late, high])
+    lag, turn = lag[rows][pair.truth], rows[pair.truth] // each
+    for one in range(len(turns)):
+        own = turn == one
+        yield np.tile(lag[own], 2), np.concatenate([late[own], high[own]])
