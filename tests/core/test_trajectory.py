@@ -160,3 +160,18 @@ def test_sbet_is_projected(tmp_path):
         read_trajectory(tmp_path / "s.sbet", crs="EPSG:4326")
     with pytest.raises(InputError, match="CRS of the strip is not understood"):
         read_trajectory(tmp_path / "s.sbet", crs="nonsense")
+
+
+def test_positions_beyond_all_places_are_dropped():
+    """Their squares overflow."""
+    time = np.array([0.0, 1.0, 2.0, 1e300, 4.0])
+    xyz = np.zeros((5, 3))
+    xyz[1] = 1e308
+    assert Trajectory.build(time, xyz).time.tolist() == [0.0, 2.0, 4.0]
+
+
+def test_positions_at_almost_the_same_time_are_dropped():
+    """Velocities of half of them overflow."""
+    time, xyz = np.array([0.0, 5e-324, 1.0, 1.0 + 2e-10, 2.0]), np.arange(15.0).reshape(5, 3)
+    built = Trajectory.build(time, xyz)
+    assert built.time.tolist() == [0.0, 1.0, 2.0] and np.isfinite(built.velocity).all()

@@ -82,3 +82,12 @@ def test_what_is_simulated_again_holds_the_echoes_noise_and_clipping():
     assert peak.mean() == pytest.approx(system.noise.baseline + 100, abs=0.3)
     expected = np.sqrt(system.noise.std**2 + 0.05 * 100 + system.noise.baseline_spread**2)
     assert peak.std() == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.filterwarnings("error")
+def test_samples_of_32_bits_are_clipped_at_their_largest_count():
+    """2^32 - 1 is no number of single precision: 2^32, which is, became 0 or whatever the processor makes of it."""
+    block = WaveformBlock.from_samples(np.zeros((3, 60), np.uint32), bits=32)
+    echoes = EchoTable.build(np.arange(3), np.full(3, 30.0), np.full(3, 1e10), np.full(3, 2.0))
+    again, _ = simulate_again(block, known_system(make_scene("flat").recording), echoes, np.random.default_rng(1))
+    assert again.samples[:, 30].tolist() == [2**32 - 1] * 3

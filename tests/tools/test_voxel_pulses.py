@@ -258,3 +258,11 @@ def test_a_wrong_ratio_is_within_the_errors(tmp_path):
     assert (found["share_error"] >= given["share_error"] - 1e-7).all()
     partly = (found["share"] > 0.1) & (found["share"] < 0.9)
     assert np.mean(found["share_error"][partly] - given["share_error"][partly]) > 1e-3
+
+
+def test_where_takes_whole_pulses(strips, tmp_path):
+    """The ground's return chooses the pulse, with its canopy."""
+    summary, found = voxelize(strips[1], tmp_path, where="z < 102")
+    whole, _ = voxelize(strips[1], tmp_path)
+    assert 0.8 * N < summary.pulses < N and summary.waveforms + summary.left_out == whole.waveforms
+    assert shares(found, LAYERS)[0] > 0.1

@@ -103,3 +103,19 @@ def test_a_grid_of_no_point_says_why(cloud, tmp_path, where, words):
     target = tmp_path / "x.tif"
     result = run_command("grid", cloud, "--column", "z", "--where", where, "-o", target)
     assert result.exit_code in (1, 2) and words in result.stderr and not target.exists()
+
+
+def test_stats_counts_them_and_what_is_left_out(cloud, split):
+    path, number, total = split
+    (found,), _ = count_returns([cloud], chosen=CHOSEN)
+    (wanted,), _ = count_returns([path])
+    assert (found.points, found.left_out) == (number, total - number)
+    assert (found.by_number, found.separations, found.flags) == (wanted.by_number, wanted.separations, wanted.flags)
+    assert any(line.startswith(f"--where: {total - number} of {total} points") for line in found.warnings)
+
+
+def test_clouds_are_compared_at_them(cloud, split):
+    path, number, total = split
+    found = compare_clouds(cloud, path, chosen=CHOSEN)
+    assert (found.matched, found.missed, found.extra) == (number, 0, 0)
+    assert (found.left_out_a, found.left_out_b) == (total - number, 0)
