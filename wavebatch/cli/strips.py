@@ -254,7 +254,7 @@ def _list_lines(output: Path, summary: SynthesisSummary, settings: SynthesisOpti
         yield f"note: {count(summary.saturated, 'return')} above the digitizer's range; lower --gain"
     if summary.scattered:
         yield f"note: {count(summary.scattered, 'pulse')} incomplete in the cloud; sort the cloud by GPS time if needed"
-    packed = summary.energy_in_packets
+    packed = summary.energy - summary.energy_without_packet
     share = f" ({summary.energy_recorded / packed:.1%})" if packed else ""
     without = f", {summary.energy_without_packet:.4g} DN ns without a packet" * bool(summary.without_packet)
     yield f"energy: {packed:.4g} DN ns modelled, {summary.energy_recorded:.4g} DN ns in the samples{share}{without}"

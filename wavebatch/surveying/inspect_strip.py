@@ -19,6 +19,7 @@ from wavebatch.core.no_data import without_nan
 from wavebatch.files.las.header import LasHeader, read_header
 from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
+from wavebatch.files.strip.scanner import describe_oddities
 
 _SAMPLED = 4096
 """Waveforms of which extremes are read."""
@@ -177,8 +178,9 @@ def name_gains(facts: StripFacts, scan: StripScan) -> Iterator[str]:
 def doubt_files(facts: StripFacts, scan: StripScan) -> Iterator[StripWarning]:
     """What is odd about the files of a strip that can be processed."""
     yield from StripWarning.of("header", facts.warnings)
+    losses = tuple(describe_oddities(scan.reasons, 0))  # points whose packets cannot be used
     for line in scan.warnings:
-        yield StripWarning("lost-packets" if line in scan.losses else "packets", line)
+        yield StripWarning("lost-packets" if line in losses else "packets", line)
 
 
 def doubt_packets(facts: StripFacts, matched: int, returns: int) -> Iterator[str]:

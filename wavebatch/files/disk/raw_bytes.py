@@ -86,18 +86,15 @@ def read_exactly(fd: int, target: np.ndarray, at: int) -> None:
     """Fill the bytes `target` (u1, contiguous) from byte `at` of the file; raises InputError if it ends before."""
     view = target.data
     while view:
-        got = os.preadv(fd, [view[: 1 << 30]], at) if hasattr(os, "preadv") else _seek_read(fd, view, at)
+        if hasattr(os, "preadv"):
+            got = os.preadv(fd, [view[: 1 << 30]], at)
+        else:  # Windows
+            os.lseek(fd, at, os.SEEK_SET)
+            data = os.read(fd, min(len(view), 1 << 24))
+            got, view[: len(data)] = len(data), data
         if not got:
             raise InputError(f"the file ends at byte {at}, {len(view)} bytes too early; it is cut or has changed")
         view, at = view[got:], at + got
-
-
-def _seek_read(fd: int, view: memoryview, at: int) -> int:
-    """Does what preadv does, for Windows, which has no preadv."""
-    os.lseek(fd, at, os.SEEK_SET)
-    data = os.read(fd, min(len(view), 1 << 24))
-    view[: len(data)] = data
-    return len(data)
 
 
 def take_whole_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:

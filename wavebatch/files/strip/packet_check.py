@@ -119,13 +119,6 @@ class DirectionTally:
         self.pairs[1] += int((clear & (away < toward)).sum())
 
 
-def find_form(points: np.ndarray) -> str:
-    """Return the form of the vectors, `stored` or `range`, from the first points of a strip."""
-    ratio = measure_ratio(points, "stored")
-    ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-    return "range" if len(ratio) and quantile(ratio, 0.5) > RANGE_RATIO else "stored"
-
-
 def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
     """Return the length of the vectors over c/2, f8 (n,); not finite if it cannot be computed."""
     vectors = stack_vectors(points)

@@ -21,7 +21,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import changeable, frozen
-from wavebatch.core.order import distinct, even_places
+from wavebatch.core.order import distinct, even_places, quantile
 from wavebatch.files.disk.raw_bytes import Closing, join_records, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
@@ -280,11 +280,6 @@ class StripScan(Closing):
         """Points whose packet lies past the end of the file: it is shorter than its packets need."""
         return self.reasons.get(check.Reason.CUT, (0, 0))[0]
 
-    @property
-    def losses(self) -> tuple[str, ...]:
-        """Those of the warnings about points whose packets cannot be used."""
-        return tuple(describe_oddities(self.reasons, 0))
-
     def close(self) -> None:
         """Remove the temporary files."""
         self.context.close()
@@ -395,7 +390,9 @@ class Scanner:
         self._head = source.read(0, most)
         """The first points, until they are scanned: those of a small strip take longer to decode than to scan."""
         has_packet = (self._head["wavepacket_index"] > 0) & (self._head["wavepacket_size"] > 0)
-        self._form = check.find_form(self._head[has_packet])
+        ratio = check.measure_ratio(self._head[has_packet], "stored")
+        ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+        self._form = "range" if len(ratio) and quantile(ratio, 0.5) > check.RANGE_RATIO else "stored"
         self._units = -(-facts.header.point_count // unit_points)
         self._thinning = max(-(-self._units // MANY_UNITS), 1)
         self._found = ScanPart(facts, self._form, self._units, sizes)

@@ -439,7 +439,7 @@ class SynthesisSummary:
     energy_recorded: float = 0.0
     """Sum of the samples above the baseline [DN ns]: less than modelled where the digitizer saturates, and where echoes
     are lower than half a count; more or less by about `energy_of_level`, and by the sum of the noise, which is 0 on
-    average. Compare it with `energy_in_packets`."""
+    average. Compare it with `energy` less `energy_without_packet`."""
     level: float = 0.0
     """Mean of the samples without an echo [DN]: above the baseline where noise below 0 is cut off, and not on it where
     rounding without noise cannot hold a fraction."""
@@ -447,11 +447,6 @@ class SynthesisSummary:
     """What this adds to `energy_recorded`, if no echo covers it [DN ns]."""
     light: LightCounts = field(default_factory=LightCounts)
     """Whose widths and shares were known."""
-
-    @property
-    def energy_in_packets(self) -> float:
-        """Of the modelled echoes with a packet [DN ns]."""
-        return self.energy - self.energy_without_packet
 
     @property
     def light_used(self) -> float:
