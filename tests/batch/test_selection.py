@@ -12,6 +12,8 @@ from wavebatch.batch.counts import LEFT_OUT
 from wavebatch.core.condition import parse_condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.cloud.cloud_reader import CloudReader
+from wavebatch.files.cloud.point_filter import PointFilter
 
 
 def _run(strip, folder, **options):
@@ -217,3 +219,18 @@ def test_the_workers_of_a_cluster_need_not_see_the_polygons(tiny_strip, tmp_path
         wb.run(tiny_strip, tmp_path, polygon=_area(tmp_path / "a.json", (0, 0, 1, 1)), energy=energy,
                trajectory=path, scheduler="tcp://there:8786")  # fmt: skip
     assert sorted(seen) == sorted([tiny_strip, path, energy])
+
+
+@pytest.mark.parametrize(
+    ("names", "where"),
+    [("wavebatch", "echo_width < 4.5"), ("riegl", "'Echo Width' < 4.65"), ("pdal", "AMPLITUDE > 30 and z > 0")],
+)
+def test_conditions_of_a_cloud_read_as_those_of_its_run(full, riegl, tmp_path, names, where):
+    """One grammar and one resolution of names: `stats --where` takes what `run --where` would have written."""
+    some, _ = _run(riegl, tmp_path / "some", where=where, names=names)
+    _run(riegl, tmp_path / "all", names=names)
+    path = next((tmp_path / "all").glob("*.laz"))
+    with CloudReader(path) as reader:
+        keep = reader.plan(PointFilter.build(where=where))
+    raw = laspy.read(path).points.array
+    assert 0 < len(some.points) == np.count_nonzero(keep.test(raw, len(raw)) == 0)

@@ -16,7 +16,7 @@ from strips import add_record
 from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.geojson import AreaFile, load_polygons, place_rings, plan_crs, read_area_file
+from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, plan_crs, read_area_file
 from wavebatch.files.las.crs import build_utm, read_crs, read_crs_definition
 from wavebatch.files.las.header import Vlr, build_wkt, read_header
 from wavebatch.tools.scan_slices import Segment
@@ -334,3 +334,16 @@ def test_gdal_finds_segments_where_they_are(tmp_path, mode):
         to_degrees = pyproj.Transformer.from_crs(info["crs"], "EPSG:4326", always_xy=True)
         assert to_degrees.transform(west, south) == pytest.approx((9.0, 48.753013), abs=1e-5)
         assert json.loads(target.read_text())["type"] == "FeatureCollection"
+
+
+def test_extents_that_are_no_numbers_hold_nothing(plain):
+    broken = _local(plain, np.nan, np.nan)
+    with pytest.raises(InputError, match="is in degrees"):
+        place_rings(read_area_file("a.geojson", None, [_square(10, 80)]), [_square(10, 80)], plain, broken)
+
+
+def test_both_extents_are_named(strip):
+    header = read_header(strip)
+    assert describe_miss([_box(strip)], header) == "" == describe_miss([], header)
+    text = describe_miss([_box(strip) + 1e5], header)
+    assert f"{_box(strip)[0, 0] + 1e5:.10g}" in text and f"{header.mins[0]:.10g}" in text and "another CRS" in text

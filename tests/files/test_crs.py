@@ -8,6 +8,7 @@ WKT from GeoTIFF keys: UTM zones to the letter of EPSG, and nothing that is not 
 import json
 import struct
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,10 @@ from hypothesis import strategies as st
 from strips import add_record, descriptor, make_raw, vlr
 from writer_tools import data_file, plan_output, write_source
 
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.las.crs import (
     METRES,
@@ -35,6 +39,7 @@ from wavebatch.files.las.crs import (
 )
 from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_projection, read_header
 from wavebatch.files.strip.reader import StripReader, measure_scale
+from wavebatch.stages.attribute.basic import position
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import FlightLine
 from wavebatch.tools.simulate.strip import WKT
@@ -491,3 +496,23 @@ def test_a_crs_that_only_pyproj_knows(tmp_path, monkeypatch):
         ):
             convert_geotiff(tmp_path, other, asked=True)
     assert '"31468"' in convert_geotiff(tmp_path, other, asked=True)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1 / 0.3048, 1e-5])
+def test_errors_along_the_ray_are_metres_in_any_unit(scale):
+    block = WaveformBlock.from_samples(np.zeros((1, 8), np.uint8))
+    block = replace(block, direction=block.direction * scale)
+    echoes = EchoTable.build(np.zeros(1), np.full(1, 4.0), np.ones(1), np.ones(1), time_err=np.full(1, 0.1))
+    noise = Noise(np.zeros(1, np.float32), np.ones(1, np.float32))
+    done = position(block, noise, SystemPulse(1.0), echoes)
+    assert done.attributes["range_err"][0] == pytest.approx(0.1 * HALF_C, rel=1e-3)
+
+
+def test_so_do_synthetic_strips(strip, tmp_path):
+    words = ["synthesize", strip, "-o", tmp_path / "s.las"]
+    result = run_command(*words)
+    assert result.exit_code == 0, result.output
+    definition = read_crs_definition(tmp_path / "s.las", read_header(tmp_path / "s.las"))
+    assert definition == repair_wkt(RIPROCESS)
+    records = [vlr.payload for vlr in read_header(tmp_path / "s.las").vlrs if vlr.record_id == WKT_ID]
+    assert records == [repair_wkt(RIPROCESS).encode() + b"\0"]

@@ -135,3 +135,11 @@ def test_numbers_of_points_that_no_file_could_hold_are_refused_at_once(tmp_path)
     path.write_bytes(data)
     with pytest.raises(InputError, match="claims 1099511627776 points"):
         CloudReader(path)
+
+
+def test_flags_of_the_account_that_are_no_unsigned_integers_are_no_flags(tmp_path):
+    names = {"amplitude": "f4", "echo_flags": "f4"}
+    path = write_renamed(tmp_path / "a.las", names, {name: name for name in names})
+    with CloudReader(path) as cloud:
+        (rows,) = cloud.read_pieces()
+    assert set(cloud.written) == {"amplitude"} and (rows["amplitude"] == 2).all() and not rows["flags"].any()

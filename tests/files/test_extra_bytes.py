@@ -97,3 +97,12 @@ def test_vendors_amplitude_keeps_clear_of_values_that_wrapped():
     record = ExtraRecord.build("Amplitude", "u2", "", scale=0.01).with_range(np.array([0]), np.array([10000]))
     empty = int(choose_no_data(record)[0])
     assert 10000 + 20000 < empty < 65536 - 20000
+
+
+def test_no_data_without_any_evidence():
+    assert np.isnan(choose_no_data(ExtraRecord.build("a", "f4", ""))[0])
+    assert choose_no_data(ExtraRecord.build("a", "u2", "")) is None
+    assert choose_no_data(ExtraRecord.undocumented("a", 3)) is None
+    assert list(choose_no_data(ExtraRecord.build("a", "u2", "", no_data=5))) == [5]
+    vector = ExtraRecord(bytes([0, 0, 29]) + bytes(189))
+    assert np.isnan(choose_no_data(vector)).tolist() == [True] * 3

@@ -264,3 +264,13 @@ def test_echoes_of_one_pulse_in_two_packets_share_its_light():
     time = np.append(np.arange(100.0), 44.0)
     found = normals.find_edges(points, np.tile([0.0, 0, -1], (101, 1)), time, np.full(101, 2.0), np.full(101, 5.0), 0.2)
     assert np.flatnonzero(found).tolist() == [44, 100]
+
+
+def test_a_step_is_no_tilt(rng):
+    """A kerb of 15 cm: the plane through both levels rises by 5 degrees."""
+    xyz = np.column_stack([rng.uniform(-6, 6, (4000, 2)), 0.02 * rng.standard_normal(4000)])
+    xyz[:, 2] += 0.15 * (xyz[:, 0] > 0)
+    down = np.tile([0, 0, -1.0], (len(xyz), 1))
+    (angle, error), _ = normals.measure_normals(xyz, down, normals.Surroundings(xyz), **SETTINGS)
+    near = np.isfinite(angle) & (np.abs(xyz[:, 0]) < 1.5) & (np.abs(xyz[:, 1]) < 4.4)
+    assert np.sqrt(np.mean((angle[near] / error[near]) ** 2)) < 1.4

@@ -23,7 +23,7 @@ from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.matching import setting, strip_match
-from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places
+from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_alike
 from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
 
 pytestmark = pytest.mark.kept_surveys
@@ -929,3 +929,11 @@ def test_a_strip_takes_its_own_constant_and_not_that_of_another_one():
     strips = tuple(StripConstant(name, name, 1, 0, value, 0.01) for name, value in (("a", 1.1), ("b", 0.9)))
     taken = {key: next(strip_match._take_strip_constants(strips, rows, key)).constant for key in "abc"}
     assert taken == {"a": 1.1, "b": 0.9, "c": 1.0}
+
+
+def test_parts_of_one_field_count_as_few(rng):
+    """A slope's error is that of independent parts, and several times as large where halves are of two fields."""
+    alone = [weigh_alike(rng.standard_normal(32)) for _ in range(50)]
+    field = np.repeat([-1.0, 1.0], 16)
+    assert 1.2 < np.median(alone) < 2.5
+    assert weigh_alike(field + 0.1 * rng.standard_normal(32)) > 8
