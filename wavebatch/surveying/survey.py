@@ -266,12 +266,12 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_again(part, system, borne, echoes)
-        # A misfit for what fits leave allows no more faint echoes beside strong ones: that by the description does.
+        # From here on the misfit alone is raised: `faint_share` stays as the description's misfit asks for.
         misfit, left = cover_fits(system, echoes, block.spacing)
         if misfit > system.misfit:
             system = replace(system, misfit=misfit)
             echoes = decompose_sample(part, system)
-        # Nor does either see a shape that changes, where two echoes describe it as well.
+        # Neither the description nor what fits leave shows a shape that changes, where two echoes describe it as well.
         if choice.best.change and suspect_pairs(echoes, system.sigma_ref):
             system = replace(system, misfit=bear(system, choice.best.change).misfit)
             echoes = decompose_sample(part, system)

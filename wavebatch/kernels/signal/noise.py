@@ -54,10 +54,13 @@ TIGHTER, LEAST_LIMIT = 0.8, 2.6
 """Factor by which the limit of signal then falls, and the limit up to which it does: at 2.56 a few per cent of noise
 are cut off."""
 
-SEEN, BY_CHANCE = 7, 0.1
-"""Reach of a pulse [samples] up to which every echo of five standard deviations of energy, the least that is fitted,
-stands above the limit of single smoothed samples; and the share of waveforms, at most, that chance takes beyond the
-limit of means over a wider pulse. Echoes of canopies that single samples do not show made noise 1.7 times as large."""
+SEEN = 7
+"""Reach of a pulse [samples] up to which single smoothed samples show every echo of five standard deviations of energy,
+the least that is fitted. Echoes of wider pulses stand out in means only: those of canopies that single samples do not
+show made noise 1.7 times as large."""
+
+BY_CHANCE = 0.1
+"""Share of the waveforms, at most, in which noise alone makes a mean over a wide pulse that is taken for an echo."""
 
 MUCH_CUT = 1.05
 """Noise before a digitizer cut it off at 0, over what is left of it, from which quiet samples are found once more."""

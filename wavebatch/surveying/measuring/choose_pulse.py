@@ -62,12 +62,15 @@ HOPELESS = 5.0
 """Standard errors by which a description is longer where a pulse is not looked at any further: chance makes so many
 once in three million times."""
 
-HINT, FEWER = 1.5, 0.95
-"""Standard errors by which another pulse must describe shorter, in place of SURE, where it needs no more echoes than a
-learned pulse of several Gaussians (AS_FEW), or where that is known to miss the stacked echoes by more than the change
-from shot to shot. And standard errors less than SURE where it needs this share of the echoes of a learned Gaussian, or
-more where it needs so many more than any; in proportion between: at a step, halves of a strip fall on either side.
-Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes 1.5 errors once in fifteen times."""
+HINT = 1.5
+"""Standard errors by which a rival must describe shorter, in place of SURE, where what was taken is doubtful itself: a
+learned pulse of several Gaussians that needs as many echoes as the rival (AS_FEW), or one that is known to miss the
+stacked echoes by more than the change from shot to shot. Chance makes so many once in fifteen times."""
+
+FEWER = 0.95
+"""Share of the echoes with which a rival wins by SURE - HINT. With the same number it needs SURE, with 5 % more
+SURE + HINT, and in proportion between: at a step, halves of a strip fall on either side. Each echo is a claim too; one
+in twenty is what `run` calls a doubt."""
 
 LEAST_SAVED, LEAST_OF_KNOWN, OTHER_WIDTH = 0.25, 2.0, 0.1
 """Nats per echo that other pulses must save in place of a Gaussian, and learned ones in place of one from elsewhere:
@@ -340,7 +343,7 @@ def _decide(found: list[Candidate]) -> Choice:
         first = min((one for one in level if AS_FEW * one.echoes <= fewest), key=lambda one: (one.typical, one.name))
         ordered += [first, *(one for one in alike if one is not first)]
     best = ordered[0]
-    for one in 2 * ordered:  # what one that was taken since had beaten may beat its successor
+    for one in 2 * ordered:  # twice: that one beats the next, and this a third, says nothing of the first and the third
         if _beats(one, best):
             best = one
     tied = [one for one in ordered if one.exceeds(best) < SURE]
@@ -469,8 +472,8 @@ def _choose_misfit(
         least = lengths[best][change]
         return best, [count_errors(lengths[place][change] - least) for place in sorted(lengths)]
 
-    # From coarse to fine, and no further down or up than echoes are false, or lost, for sure. Each step looks first at
-    # its ends: what they explain alike is not fitted again.
+    # Places in MISFITS. From coarse to fine, and no further down or up than echoes are false, or lost, for sure. Each
+    # step looks first at its ends: what they explain alike is not fitted again.
     middle = 6 if COVERED * change > MISFITS[5] else 2
     for end in (0, len(MISFITS) - 1):
         if middle == 2:  # the largest is nearly always looked at, and few waveforms lie between the two
@@ -499,7 +502,9 @@ def _choose_misfit(
         # Near its least a length is a parabola.
         over, under = np.sqrt(longer[first - 1]), np.sqrt(max(longer[first], 0.0))
         misfit = float(before * (after / before) ** ((over - 1) / (over - under)))
-    misfit = max(misfit, missed)
+    # In a canopy neighbours are in the stack too: no more than descriptions allow.
+    allowed = between[np.interp(between, places, longer) <= SURE]
+    misfit = max(misfit, min(missed, float(MISFITS[0] * 2.0 ** max(allowed, default=0.0))))
     place = float(np.log2(max(misfit / MISFITS[0], 1.0)))  # none is taken where the least one was looked at
     return misfit, doubt, _explain_between(block, at(misfit), changes, found, place).explained
 
