@@ -85,6 +85,7 @@ RUNS = [
     (f"{RUN} --profile balance", 2, "did you mean 'balanced'"),
     (f"{RUN} --profile autp", 2, "did you mean 'auto'"),
     (f"{RUN} --columns +echo_tim", 2, "did you mean 'echo_time'"),
+    (f"{RUN} --columns +range,-amplitude", 2, "'-amplitude': a column cannot be taken away; list all that are wanted"),
     (f"{RUN} --columns ''", 2, "--columns: names no column; leave it out for the usual ones"),
     (f"{RUN} --chain none.toml", 2, "none.toml: chain file cannot be read"),
     (f"{RUN} --chain fast", 2, "there is no such file; the shipped chain is --profile fast"),
@@ -323,6 +324,7 @@ PICTURES = [
         ("--column amplitud", 2, "did you mean 'amplitude'? Columns of the file: amplitude, echo_flags"),
         ("--column qqqqqq", 2, "known are amplitude"), ("--column intensity --flags WEEK", 2, "did you mean 'WEAK'"),
         ("--column intensity --flags NO_WAVEFORM", 1, "1000 of 1000 points are left out by their flags"))),
+    (f"{PROFILE} cloud.laz --statistic mean", 2, "needs a --column; --statistic count needs none"),
     *((f"plot {kind} {cloud} -o p.png --column {column}", code, why) for kind in ("histogram", "map")
       for cloud, column, code, why in (
         ("none.laz", "z", 1, "none.laz"), ("broken.laz", "z", 1, "broken.laz"),

@@ -16,7 +16,7 @@ MADE = sorted({name for stage in STAGES.values() if stage.kind == "attribute" fo
 def test_every_column_that_a_stage_makes_can_be_asked_for(column):
     chain = load_profile("fast")
     if column.startswith("skew"):  # of decomposers that no shipped chain has
-        with pytest.raises(wb.ConfigError, match="fits no skew per echo; use decompose"):
+        with pytest.raises(wb.ConfigError, match="fits no skew per echo; put decompose.skewed .* --chain"):
             with_columns(chain, [column])
         return
     full = with_columns(chain, [column])
@@ -38,6 +38,15 @@ def test_shipped_chains_get_the_stages(tiny_strip, tmp_path, chain, columns):
     known = np.isfinite(cloud["amplitude"])
     assert known.any() and np.isfinite(cloud["energy"][known]).all() and np.isfinite(cloud["range"][known]).any()
     assert ("echo_width" in cloud.dtype.names) == columns.startswith("+")
+
+
+def test_a_column_that_was_asked_for_and_has_no_value_is_a_warning(tiny_strip, tmp_path):
+    result = wb.run(tiny_strip, tmp_path, chain="fast", columns="+cross_section,+incidence_angle")
+    warnings = {one.text.split(":")[0]: one for one in result.outcomes[0].report.warnings if one.code == "no-value"}
+    assert sorted(warnings) == ["cross_section", "incidence_angle"] and all(one.is_loud for one in warnings.values())
+    assert "not calibrated; give --calibration" in warnings["cross_section"].text
+    assert "`wavebatch survey STRIP --divergence MRAD -o SYSTEM.toml`" in warnings["incidence_angle"].text
+    assert not [line for line in result.outcomes[0].report.remarks if "none of" in line]
 
 
 @pytest.mark.parametrize("column", ["range", "relative_backscatter", "relative_reflectance", "cross_section"])

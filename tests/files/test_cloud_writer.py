@@ -158,9 +158,11 @@ def test_version_format_and_legacy_fields_agree(tmp_path, las_version, made, vlr
 
 def test_what_las_1_3_cannot_hold_is_refused(tmp_path):
     write_source(tmp_path / "nine.las", 9, (1, 4))
-    line = "nine.las: --las-version 1.3 has no point format 6, and the strip's points of format 9 .*; leave --las"
+    line = "nine.las: --las-version 1.3 has no point format 6: .*; leave --las-version out: points of format 9"
     with pytest.raises(ConfigError, match=line):
         plan_output(tmp_path / "nine.las", [], las_version="1.3")
+    with pytest.raises(ConfigError, match="contradicts --point-format 6: its last format is 5; leave --las-v"):
+        plan_output(tmp_path / "nine.las", [], las_version="1.3", point_format=6)
     write_source(tmp_path / "evlr.las", 4, (1, 4), evlrs=[(b"me", 7, b"x")])
     with pytest.raises(InputError, match="evlr.las: has extended records"):
         plan_output(tmp_path / "evlr.las", [], las_version="1.3")

@@ -398,7 +398,7 @@ def test_air_that_a_vendors_column_still_holds_is_taken_off(tmp_path, held):
 @pytest.mark.parametrize(
     ("change", "name", "message"),
     [
-        ({"vendor": "percent"}, "Reflectance", "it holds neither dB nor shares of 1"),
+        ({"vendor": "percent"}, "Reflectance", "nor as a share of 1); give a column of reflectances"),
         ({"vendor": "dB"}, "reflectanse", "--from-column: no extra byte is called 'reflectanse'; did you mean"),
     ],
 )

@@ -145,6 +145,8 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
     chosen = [entry for entry in entries if not entry.startswith("+")]
     if wanted is not None and not entries:
         raise ConfigError("--columns: names no column; leave it out for the usual ones, or write a,b or +a,+b")
+    if away := [entry for entry in entries if entry.startswith("-")]:
+        raise ConfigError(f"--columns: {away[0]!r}: a column cannot be taken away; list all that are wanted, without +")
     if chosen and entries[0].startswith("+"):
         raise ConfigError(
             f"--columns: '+{added[0]}' adds, but {chosen[0]!r} has no +; write +{chosen[0]} to add it too"

@@ -19,7 +19,7 @@ from typing import Any
 
 from wavebatch import __version__
 from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
-from wavebatch.batch.job import StripJob
+from wavebatch.batch.job import StripJob, split_columns
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StripWarning
@@ -368,6 +368,14 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
             "value: leave these points out before a mean (flag ADDED)"
         )
+    return (*lines, *_explain_columns(prepared, report)[0])
+
+
+def _explain_columns(prepared: Prepared, report: RunReport) -> tuple[list[str], list[str]]:
+    """Why columns have no value, or few: lines for remarks, and those for warnings: --columns names their column."""
+    lines: list[str] = []
+    missed: list[str] = []
+    asked = {entry.removeprefix("+") for entry in split_columns(prepared.job.options.columns)}
     wanted = {*prepared.job.columns, *prepared.needed}
     for column, counts in sorted(report.no_data.items()):
         if column not in wanted:
@@ -380,13 +388,15 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             if column == _ANGLE and first in (NoData.UNCERTAIN, NoData.SHORT_PULSE, NoData.TOO_STEEP):
                 outlook = _look_out(prepared, report)
                 meaning = f"{meaning}: {outlook.reason}" if outlook is not None else meaning
-            lines.append(f"{column}: none of {total} echoes has one; {share}{meaning}; {remedy}")
+            (missed if column in asked else lines).append(
+                f"{column}: none of {total} echoes has one; {share}{meaning}; {remedy}"
+            )
         elif total and column == _ANGLE:
             outlook = _look_out(prepared, report)
             if outlook is not None and not outlook.possible:
                 remedy = REASONS[NoData.UNCERTAIN][1]
                 lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
-    return tuple(lines)
+    return lines, missed
 
 
 def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, str]) -> tuple[StripWarning, ...]:
@@ -472,6 +482,7 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
             f"learned pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
         )
         found += warn("false-echoes", [line])
+    found += warn("no-value", _explain_columns(prepared, report)[1])
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
 

@@ -40,7 +40,7 @@ class NoData(IntEnum):
     NO_DIVERGENCE = (
         3,
         "the beam's divergence is not known",
-        "put divergence_mrad of the data sheet into SYSTEM.toml or CAL.toml",
+        "give --system with the SYSTEM.toml of `wavebatch survey STRIP --divergence MRAD -o SYSTEM.toml`",
     )
     SHORT_PULSE = (
         4,

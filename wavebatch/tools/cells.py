@@ -178,7 +178,7 @@ def check_statistic(
     if statistic in ("count", "density"):
         return
     if column is None:
-        raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
+        raise ConfigError(f"--statistic {statistic} needs a --column; --statistic count needs none")
     if facts is not None and facts.is_flags:
         raise ConfigError(f"{path}: {facts.name} are bits, which have no {statistic}; count the points with a flag: "
                           "--statistic count --flags NAME")  # fmt: skip

@@ -72,10 +72,11 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
     notes = (_REPAIRED,) * wrong
     if wanted == "1.3":  # if it can hold all that the strip has
         if target >= 6:
-            needed = header.point_format >= 6
-            what = "leave --las-version out" if needed else "leave one of the two out"
-            reason = f", and the strip's points of format {header.point_format} fit into no other" if needed else ""
-            raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}{reason}; {what}")
+            clash = "has no point format" if point_format is None else "contradicts --point-format"
+            what = "leave one of the two out"
+            if header.point_format >= 6:
+                what = f"leave --las-version out: points of format {header.point_format} fit into formats 6 to 10 only"
+            raise ConfigError(f"{path}: --las-version 1.3 {clash} {target}: its last format is 5; {what}")
         if any(evlr.record_id != las.WAVEFORM_RECORD_ID for evlr in evlrs):
             raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
         if _tell_crs(header.vlrs) == (True, False):

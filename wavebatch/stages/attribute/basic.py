@@ -39,7 +39,10 @@ def _need_free_skew(step: Step, chain: Chain, system: SystemPulse | None) -> str
     free = decomposer.stage.name == "decompose.skewed" and decomposer.effective()["kappa"] == "free"
     if free or "skew" in decomposer.stage.makes:
         return ""
-    return f'{decomposer.stage.name} fits no skew per echo; use decompose.skewed with kappa = "free" before it'
+    return (
+        f'{decomposer.stage.name} fits no skew per echo; put decompose.skewed with kappa = "free" in its place, in '
+        "the file that `wavebatch survey STRIP --chain CHAIN.toml` writes, and give that as --chain"
+    )
 
 
 @stage("attribute", makes=("echo_width", "echo_width_err"))

@@ -308,7 +308,7 @@ def measure_column(
     if len(rows) < LEAST_ECHOES or not blank.reflectance < MOST_REFLECTANCE:
         reason = f"{len(rows)} clean single echoes have a reflectance, {LEAST_ECHOES} are needed"
         if len(rows) >= LEAST_ECHOES:
-            reason = f"its median is {blank.reflectance:.3g}: it holds neither dB nor shares of 1"
+            reason = f"its median is {blank.reflectance:.3g}: no reflectance in dB (below 0), nor as a share of 1"
         return replace(blank, refused=reason), rows[:0], np.empty(0)
     constant, held, air_err = _take_off_air(4.0 * facing / rows["light"], rows["distance"], attenuation)
     result = replace(summarise(blank, constant), air=held)
@@ -475,7 +475,8 @@ def build_calibration(
     if whole is None:
         miss = describe_miss([target.corners for target in targets], source.reader.facts.header) if targets else ""
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
-        raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
+        remedy = "give a column of reflectances" if options.column else "check coordinates and targets"
+        raise InputError(f"{source.path}: no target gives a constant ({reasons}); {remedy}")
     used = np.concatenate([rows for _, rows, _ in measured])
     ranging = math.hypot(measure_ranging(source.sensor, used["distance"], source.air), source.sent.growth)
     # By how much constants are off for echoes that a compressing receiver makes darker or brighter than the
