@@ -59,6 +59,11 @@ from wavebatch.surveying.systems.known_systems import (
 from wavebatch.surveying.systems.skew import measure_skew
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
+NARROWER = 0.85
+"""Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
+were none: those next to signal are not quiet, by widths of the pulse. Without isolated echoes they were found with a
+guess of it."""
+
 LEAST_RINGING = 0.01
 """Share of an echo from which what a Gaussian leaves after each one is an after-pulse, whose echoes get a flag."""
 
@@ -245,9 +250,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         gaussians = (one.nats for one in choice.tried if one.name.startswith("gaussian"))
         figures.gaussian_nats = min(gaussians, default=None)
         part = thin_samples(block, RESIDUAL_LOOK)
-        if len(main) < ENOUGH_TO_LEARN:
+        narrower = not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref
+        if narrower or len(main) < ENOUGH_TO_LEARN:
             noise = measure_once_more(block, system)
-            if noise.by_kind["quiet"]:
+            if narrower or noise.by_kind["quiet"]:
                 system = replace(system, noise=replace(noise, gain=first.noise.gain))
         borne = bear(system, choice.best.change)
         echoes = decompose_sample(part, borne)
