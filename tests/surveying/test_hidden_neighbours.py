@@ -36,6 +36,15 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+def test_what_is_hidden_changes_errors_and_no_echo():
+    block, _ = simulate_block("forest", 3000, np.random.default_rng(3))
+    system = survey_block(block).system
+    found, bare = (ACCURATE.run(block, one) for one in (system, replace(system, hidden=(), hidden_light=())))
+    for name in ("time", "amplitude", "sigma", "sigma_err", "flags"):
+        assert np.array_equal(getattr(found, name), getattr(bare, name)), name
+    assert (found.amplitude_err >= bare.amplitude_err).all() and (found.time_err >= bare.time_err).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["forest", "mixed", "urban"])
 def test_errors_cover_hidden_neighbours(scene):

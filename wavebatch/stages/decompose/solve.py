@@ -294,12 +294,13 @@ def fit_candidates(
         return describe_solution(block, noise, system, clusters, solution, settings, significance, columns)
 
     table = describe(clusters, solution)
-    if not settings.known:
-        return table
-    table = _leave_out_unknown(table, samples, clusters, solution, settings, describe)
-    proven = (table.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
-    share = np.where(proven, table.amplitude / (PROVEN * table.amplitude_err), 1.0)
-    return scale_errors(table, np.minimum(share, 1.0))
+    if settings.known:
+        table = _leave_out_unknown(table, samples, clusters, solution, settings, describe)
+        proven = (table.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
+        share = np.where(proven, table.amplitude / (PROVEN * table.amplitude_err), 1.0)
+        table = scale_errors(table, np.minimum(share, 1.0))
+    # Last: neighbours that were not found say nothing about whether an echo is there.
+    return cover_hidden(table, system, len(block)) if settings.grow else table
 
 
 PROVEN = 2.0
@@ -452,6 +453,4 @@ def describe_solution(
     table = cover_misfit(table, system, spacing)
     if CLUSTER in given:
         table = table.with_attributes(**{FACTOR: table.attributes[FACTOR] * table.amplitude_err / fitted_err})
-    if settings.grow:
-        table = cover_hidden(table, system, len(block))
     return flag_echoes(block, noise, system, clear_lone(table))
