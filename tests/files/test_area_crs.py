@@ -336,12 +336,6 @@ def test_gdal_finds_segments_where_they_are(tmp_path, mode):
         assert json.loads(target.read_text())["type"] == "FeatureCollection"
 
 
-def test_extents_that_are_no_numbers_hold_nothing(plain):
-    broken = _local(plain, np.nan, np.nan)
-    with pytest.raises(InputError, match="is in degrees"):
-        place_rings(read_area_file("a.geojson", None, [_square(10, 80)]), [_square(10, 80)], plain, broken)
-
-
 def test_both_extents_are_named(strip):
     header = read_header(strip)
     assert describe_miss([_box(strip)], header) == "" == describe_miss([], header)

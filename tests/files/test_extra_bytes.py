@@ -102,6 +102,8 @@ def test_vendors_amplitude_keeps_clear_of_values_that_wrapped():
 def test_no_data_without_any_evidence():
     assert np.isnan(choose_no_data(ExtraRecord.build("a", "f4", ""))[0])
     assert choose_no_data(ExtraRecord.build("a", "u2", "")) is None
+    same = ExtraRecord.build("a", "u2", "").with_range(np.array([5]), np.array([5]))
+    assert choose_no_data(same) is None, "no writer filled equal extremes in"
     assert choose_no_data(ExtraRecord.undocumented("a", 3)) is None
     assert list(choose_no_data(ExtraRecord.build("a", "u2", "", no_data=5))) == [5]
     vector = ExtraRecord(bytes([0, 0, 29]) + bytes(189))

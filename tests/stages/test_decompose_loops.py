@@ -10,7 +10,7 @@ from given_echoes import known_noise, known_system, simulate_echoes
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.kernels.fit import render
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
@@ -205,3 +205,13 @@ def test_long_waveforms_are_rendered_in_pieces_that_do_not_depend_on_other_wavef
         np.testing.assert_allclose(whole[row], dense, rtol=1e-4, atol=1e-3)
         alone = render.render_echoes(shape, 1, s, np.zeros(len(own), np.int32), *(values[own] for values in columns))
         np.testing.assert_array_equal(alone[0], whole[row])
+
+
+def test_the_loop_stops_at_its_number_of_echoes():
+    rng = np.random.default_rng(3)
+    block = WaveformBlock.from_samples(rng.integers(0, 256, (50, 80)).astype(np.uint8))
+    noise = Noise(np.full(50, 20, np.float32), np.ones(50, np.float32))
+    for most in (1, 3):
+        start = decompose("gaussian", block, noise, tolerance=0.1).count(50)
+        number = decompose("residual_loop", block, noise, max_echoes=most).count(50)
+        assert (number <= np.maximum(start, most) + 1).all()

@@ -441,14 +441,3 @@ def test_the_light_of_a_generalized_echo_is_its_integral(power):
     area = np.sum(np.exp(-0.5 * np.abs(time / unit) ** power)) / np.sum(np.exp(-0.5 * (time / 3.0) ** 2))
     echoes = EchoTable.build([0], [20.0], [50.0], [3.0]).with_attributes(power=np.array([power], np.float32))
     assert echo_light(block, SYSTEM, echoes) == pytest.approx([150.0 * area], rel=2e-4)
-
-
-def test_attributes_read_widths_as_the_pulse_that_was_fitted():
-    """On a skewed strip a Gaussian's width at half maximum is 2.3548 sigma, not that of the survey's pulse."""
-    block = planes(SKEWED, 0.0, n=50)
-    text = "".join(
-        f'[[chain]]\nstage = "{name}"\n'
-        for name in ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.echo_width")
-    )
-    found = parse_chain(text, "c").run(block, SKEWED)
-    np.testing.assert_allclose(found.attributes["echo_width"], 2.354820 * found.sigma, rtol=1e-5)

@@ -17,7 +17,7 @@ from wavebatch.tools.simulate import (
     render,
     shape_pulse,
 )
-from wavebatch.tools.simulate.scenes import HAZARDS, SEED_BLOCK, simulate_blocks
+from wavebatch.tools.simulate.scenes import HAZARDS, SEED_BLOCK, flag_truth, simulate_blocks
 
 ALL = [*SCENES, *(f"stiff.{name}" for name in HAZARDS)]
 
@@ -182,3 +182,18 @@ def test_a_village_has_roofs_of_all_angles_as_bright_as_they_reflect():
     assert gamma == pytest.approx(4 * np.where(roof, 0.4, 0.2) * np.cos(rays.incidence), rel=1e-5)
     assert np.median(energy[roof]) > np.median(energy[~roof])
     assert (block.samples == block.digitizer.max_count).any(axis=1).mean() < 0.01
+
+
+def test_flags_of_the_truth():
+    scene = find_scene("mixed")
+    _, truth = make_block(scene, 5000, seed=9)
+    flags = flag_truth(truth, scene.recording).flags
+    for row in np.random.default_rng(0).integers(0, len(truth), 300):
+        same = np.flatnonzero(truth.waveform == truth.waveform[row])
+        others = same[same != row]
+        wide = np.maximum(truth.sigma[others], truth.sigma[row]).astype(float)
+        neighbours = np.abs(np.arange(len(truth))[others] - row) == 1
+        close = (np.abs(truth.time[others] - truth.time[row]) < 4 * wide) & neighbours
+        assert bool(flags[row] & EchoFlag.OVERLAPPED) == bool(close.any())
+        assert bool(flags[row] & EchoFlag.SATURATED) == (truth.amplitude[row] + 12 > 255)
+        assert bool(flags[row] & EchoFlag.WEAK) == (truth.amplitude[row] < 5 * scene.recording.recorded_noise)
