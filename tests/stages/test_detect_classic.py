@@ -67,3 +67,8 @@ def test_pairs_with_one_run_are_one_echo_for_levels_and_two_for_derivatives():
     np.testing.assert_allclose(detect("zero_crossing", block, noise).time, [30, 37], atol=0.4)
     inflections = detect("zero_crossing", block, noise, derivative="second")
     np.testing.assert_allclose(inflections.time, [30, 37], atol=0.5)
+
+
+def test_half_of_the_distance_of_the_inflections_is_the_width():
+    block, noise = record(20, (200, np.linspace(39, 41, 20)), std=0.0)
+    np.testing.assert_allclose(detect("zero_crossing", block, noise, derivative="second").sigma, SIGMA, rtol=0.03)

@@ -197,3 +197,9 @@ def test_flags_of_the_truth():
         assert bool(flags[row] & EchoFlag.OVERLAPPED) == bool(close.any())
         assert bool(flags[row] & EchoFlag.SATURATED) == (truth.amplitude[row] + 12 > 255)
         assert bool(flags[row] & EchoFlag.WEAK) == (truth.amplitude[row] < 5 * scene.recording.recorded_noise)
+
+
+def test_signal_adds_variance_when_asked():
+    recording = Recording(bits=16, noise_std=2.0, noise_gain=0.5, baseline=100.0, baseline_spread=0.0)
+    counts = render.record_counts(recording, np.full((3000, 80), 400.0, np.float32), np.random.default_rng(3))
+    assert counts.std() == pytest.approx(np.sqrt(4 + 0.5 * 400), rel=0.02)
