@@ -215,3 +215,17 @@ def test_the_loop_stops_at_its_number_of_echoes():
         start = decompose("gaussian", block, noise, tolerance=0.1).count(50)
         number = decompose("residual_loop", block, noise, max_echoes=most).count(50)
         assert (number <= np.maximum(start, most) + 1).all()
+
+
+@pytest.mark.parametrize("std", [1.0, 4.0])
+def test_the_stop_rule_in_counts_does_not_depend_on_the_noise(std):
+    """A second echo of 20 counts is added by a limit of 14 counts, whatever the noise is said to be, and not by 26."""
+    recording = replace(RECORDING, noise_std=0.1)
+    block, _ = simulate_echoes(recording, np.tile([20.0, 32.0], (40, 1)), np.array([200.0, 20.0]), 2.0,
+                               np.random.default_rng(1))  # fmt: skip
+    noise = replace(known_noise(recording, 40), std=np.full(40, std, np.float32))
+    first = EchoTable.build(np.arange(40), np.full(40, 20.0), np.full(40, 200.0), np.full(40, 2.0))
+    loop = STAGES["decompose.residual_loop"].function
+    for limit, expected in ((14.0, 2), (26.0, 1)):
+        found = loop(block, noise, SYSTEM, first, t_diff=limit, t_unit="count", significance=0.0)
+        assert (found.count(40) == expected).all(), limit
