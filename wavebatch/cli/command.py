@@ -242,7 +242,7 @@ def _convert(value: Any, option: click.Option, path: Path) -> Any:
 
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "Options": ("grid columns", "slice most"),
+    "Options": ("grid columns", "slice most", "stats polygon", "simulate most", "synthesize divergence"),
     READING: ("grid crs",),
     CHAIN: ("waveforms", "divergence"),
     AIR: ("reflectance_error", "scan_angle"),

@@ -230,7 +230,8 @@ def run(**options: Any) -> None:
     on_stdout = [*["--report -"][: report == "-"], *["--json"][: options["as_json"]]]
     on_stdout += ["--progress json"][: options["progress"] == "json"]
     if len(on_stdout) > 1:
-        raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; give the report a file")
+        remedy = "give the report a file" if report == "-" else "leave one out"
+        raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; {remedy}")
     try:
         # The processes that will surely be needed start before this one imports what it needs itself. A limit of memory
         # may allow fewer, and resume may find nothing to do.

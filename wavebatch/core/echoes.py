@@ -1,7 +1,8 @@
 """The echo table that flows through a chain, and the one declaration of its columns and flags.
 
-Every stage returns an EchoTable. The cloud writer, the report and the tests of the README read COLUMNS and EchoFlag.
-Names, bits and dtypes are written to files: do not change those that exist, add new ones at the end.
+Every stage returns an EchoTable. The cloud writer, the report and docs/columns.md have what COLUMNS and EchoFlag say.
+Names, bits and dtypes are written to files: do not change those that exist. A new flag takes the next bit; a new column
+may stand anywhere, beside those that it belongs to.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class EchoFlag(IntFlag):
 
 
 FLAG_MEANINGS: dict[EchoFlag, str] = {flag: flag.meaning for flag in EchoFlag}
-"""Meaning of each flag, as the README lists it."""
+"""Meaning of each flag, as docs/columns.md lists it."""
 
 UNCLEAN = (
     EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
@@ -66,7 +67,7 @@ PASSED_THROUGH = EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECH
 
 @frozen
 class Column:
-    """Declaration of one per-echo quantity, used by the README's table, the LAS extra bytes and the report."""
+    """Declaration of one per-echo quantity, used by docs/columns.md, the LAS extra bytes and the report."""
 
     name: str
     """Name in files and reports."""
@@ -75,7 +76,8 @@ class Column:
     unit: str
     """Unit as text; "-" where there is none."""
     meaning: str
-    """One line for the table of columns."""
+    """One line for the table of columns. Extra bytes hold 32 bytes of it with the unit: a longer one needs a
+    short form in `_SHORT` of files/cloud/column_names.py."""
     no_data: float | None = -9999.0
     """Value that stands for NaN in files; None where every value is valid."""
     extra_bytes: bool = True
@@ -155,13 +157,13 @@ class EchoTable:
     time: np.ndarray
     """Centre of the echo after sample 0, float64 (m,), ns."""
     amplitude: np.ndarray
-    """Peak above the baseline, float32 (m,), count."""
+    """Peak above the baseline, float32 (m,), DN."""
     sigma: np.ndarray
     """Gaussian standard deviation, float32 (m,), ns."""
     time_err: np.ndarray
     """One standard deviation of time, float32 (m,), ns."""
     amplitude_err: np.ndarray
-    """One standard deviation of amplitude, float32 (m,), count."""
+    """One standard deviation of amplitude, float32 (m,), DN."""
     sigma_err: np.ndarray
     """One standard deviation of sigma, float32 (m,), ns."""
     relative_energy_err: np.ndarray
@@ -201,7 +203,7 @@ class EchoTable:
         ----------
         waveform : int (m,)
             Row of the block.
-        time, amplitude, sigma : float (m,), ns, count, ns
+        time, amplitude, sigma : float (m,), ns, DN, ns
             Centre, peak and Gaussian standard deviation of each echo.
         attributes : mapping of arrays (m,), optional
             Further columns by name.

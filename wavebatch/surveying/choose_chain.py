@@ -245,7 +245,7 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
 
     Returns
     -------
-    Choice
+    ChainChoice
 
     Raises
     ------
@@ -293,13 +293,13 @@ def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request
     ----------
     reader : StripReader
     scan : StripScan
-    choice : Choice
+    choice : ChainChoice
         Of `make_choice`.
     request : Request
 
     Returns
     -------
-    Choice
+    ChainChoice
         With two predictions, of the user's chain and of the accurate one, where the first finds more false echoes by
         MOST_FALSE; else the same one.
 
@@ -341,7 +341,7 @@ def describe_survey(choice: ChainChoice, request: Request, fingerprint: Mapping[
 
     Parameters
     ----------
-    choice : Choice
+    choice : ChainChoice
     request : Request
     fingerprint : mapping
         Of the strip that is run, to see whether a saved survey was made on it.

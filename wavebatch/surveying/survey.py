@@ -353,6 +353,7 @@ def _decide(
     skew = "no pulse was learned"
     if figures.misfit_skewed is not None:
         misfit = f"it misses the stacked echoes by {figures.misfit_skewed:.4f} of the amplitude"
+        misfit += "" if figures.misfit_goal is None else f"; noise hides {figures.misfit_goal:.4f}"
         skew = f"with kappa {figures.kappa:z.3f} {misfit}"
     return (
         *((Decision(Part.INVERTED, True, inverted),) if figures.inverted else ()),

@@ -82,7 +82,7 @@ class PointFilter:
         box = None if bbox is None else tuple(map(float, bbox))
         if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
             order = "must be west, south, east, north, with west < east and south < north"
-            raise ConfigError(f"--bbox: {list(bbox or ())} {order}")
+            raise ConfigError(f"--bbox: {','.join(f'{edge:.15g}' for edge in box)} {order}")
         polygons, file = () if polygon is None else tuple(load_polygons(polygon)), None
         if polygon is not None:
             # All that decides where they lie; the strip's part of it is in its header, which --resume compares too.

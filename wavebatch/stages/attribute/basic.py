@@ -108,7 +108,8 @@ def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, ech
     """Deviation of each echo from the fitted pulse: sqrt(h3^2 + h4^2) of its residual, per unit of A/std sqrt(s/T).
 
     The Gauss-Hermite moments h3 (skew) and h4 (peakedness) of a right fit are standard normal numbers, so noise alone
-    gives about 1.25 std/A sqrt(T/s). Merged echoes and sloping targets give more.
+    gives about 1.25 std/A sqrt(T/s): A is the amplitude, std the noise, s the sigma, T the spacing. Merged echoes
+    and sloping targets give more.
 
     References
     ----------

@@ -277,9 +277,9 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         if unseen or hidden:
             code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
         elif known and not few:
-            misfit = f"{100 * system.misfit:.2g} %" if system.misfit else "none found"
-            noise = f"noise, {system.noise.std:.3g} DN"
-            code, guess = "noise-guess", f"{noise}, and the pulse's misfit, {misfit}, are guesses"
+            misfit = f"{100 * system.misfit:.2g} % of the amplitude" if system.misfit else "nothing"
+            noise = f"noise of {system.noise.std:.3g} DN"
+            code, guess = "noise-guess", f"{noise} is a guess, and so is what the pulse misses of echoes, {misfit}"
         yield StripWarning(
             code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
             f"{remedy}",
