@@ -161,7 +161,8 @@ FILES = [
     ("info e.las", 1, "it is empty", {"e.las": ""}),
     ("info e.las", 1, "e.las: not a LAS or LAZ file (it does not begin with LASF)\n", {"e.las": "nothing"}),
     ("bench none.las", 1, "none.las"), (f"{SURVEY} -o system.json", 2, "written as TOML; name it system.toml"),
-    *((f"{words} empty", 2, "empty: the folder holds no .las or .laz file\n") for words in ("check", "stats")),
+    (f"{SURVEY} -o system.txt", 2, "written as TOML; name it system.toml"),
+    *((f"{words} empty", 2, "no .las or .laz file; --recursive takes those of") for words in ("check", "stats")),
     *((f"{words.format(name)}", 1, name, {"x.las": "no strip"}) for name in ("x.las", "none.las") for words in (
         "voxelize {} -o v.npz --size 1", f"{HISTOGRAM} --column z {{}}", f"{MAP} --column z {{}}")),
     ("compare strip.las none.las", 2, "none.las"), ("compare cloud.laz broken.laz", 2, "broken.laz"),

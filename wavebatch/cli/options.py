@@ -334,7 +334,7 @@ def common_options(*names: str, failure: int = 1) -> Callable:
     return decorate
 
 
-_NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
+_NO_TOML = (".json", ".csv", ".txt", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
 
 
 def check_toml(target: Path | None) -> None:

@@ -183,7 +183,8 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
             yield from chosen
             return
     *names, last = [suffix for suffixes in kinds for suffix in suffixes]
-    raise ConfigError(f"{problem} no {', '.join(names)} or {last} file")
+    hint = "; --recursive takes those of its subfolders too" if os.path.isdir(path) and not recursive else ""
+    raise ConfigError(f"{problem} no {', '.join(names)} or {last} file{hint}")
 
 
 def _walk(folder: Path) -> list[str]:

@@ -316,7 +316,7 @@ NO_ROWS = np.empty((0, 5))
 
 
 class WholePulse(NamedTuple):
-    """A pulse by its fitted width [samples]."""
+    """How a fit becomes the echo of the whole pulse: datum, peak and sigma, by the fitted width [samples]."""
 
     kind: int = AS_FITTED
     near: np.ndarray = NO_ROWS

@@ -114,8 +114,9 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
     Notes
     -----
     An echo that hides another is wider than the pulse. Among echoes of one width the root mean square of their errors
-    is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2). Of light it is the mean: few
-    echoes have a third of theirs from another target, and the root mean square would be the error of hardly any.
+    is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2). Amplitudes and energies get
+    the mean instead: few echoes have a third of their light from another target, and the root mean square would be the
+    error of hardly any. Column 1 of both tables is of lone echoes, column 2 of others.
     """
     if not system.hidden:
         return table
