@@ -38,13 +38,14 @@ from wavebatch.kernels import library
 from wavebatch.kernels.fit import decompose
 library.LIBRARY = Path({str(built)!r})
 samples, candidates, clusters, settings = draw_problem(np.random.default_rng(1))
-clusters = clusters._replace(high=clusters.high + 5000)
 try:
-    decompose.decompose_clusters(samples, candidates, clusters, settings)
+    further = clusters._replace(high=clusters.high + 5000)
+    decompose.decompose_clusters(samples, candidates, further, settings)
 except ValueError as error:
     print(error)
-decompose._check = lambda samples, candidates, clusters: (candidates, clusters)
-clusters = clusters._replace(**{{name: field.astype(np.int64) for name, field in clusters._asdict().items()}})
+checked = decompose._as_problem(samples, candidates, clusters, settings)
+checked[1].arrays[1].high[:] += 5000
+decompose._as_problem = lambda *_: checked
 decompose.decompose_clusters(samples, candidates, clusters, settings)
 """
     done = subprocess.run([sys.executable, "-c", code], env=sanitizing.environment(), capture_output=True, text=True)

@@ -110,3 +110,10 @@ def test_a_pulse_that_sees_no_echo_does_not_win_by_having_none(number, tmp_path)
     """24 waveforms with echoes; and pulses of 1.4 and 1.6 samples in noise of colour, taken for 270 to 450."""
     result = judge_strip(number, tmp_path)
     assert result["right"] and 0.95 < result["width_ratio"] < 1.2
+
+
+@pytest.mark.slow
+def test_noise_is_found_again_where_all_echoes_have_another_width(tmp_path):
+    """That of a pulse was 1.7 times too large, and 6 % of the clear echoes were lost."""
+    result = judge_strip(2627, tmp_path)
+    assert result["right"] and result["missed"] < 0.01

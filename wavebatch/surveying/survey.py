@@ -67,6 +67,7 @@ guess of it."""
 LEAST_RINGING = 0.01
 """Share of an echo from which what a Gaussian leaves after each one is an after-pulse, whose echoes get a flag."""
 
+
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
     """Survey of a strip from blocks sampled over it.
 

@@ -25,8 +25,9 @@ from wavebatch.stages.flags import use_noise_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import noise_factors
 
-MOST_ROUNDS = 12
-"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
+MOST_ROUNDS, MOST_RETURNS = 12, 3
+"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width. And times that
+all echoes may send back to it."""
 
 FAR_OFF = 0.1
 """Change of a width that was nearly known, as a share of it, from which it is looked for from the start."""
@@ -113,15 +114,20 @@ def measure_begin(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPul
 def measure_whole(block: WaveformBlock, begin: SystemPulse, *, cleaned: bool = False) -> SystemPulse:
     """As `measure_gaussian`, from NOISE_LOOK samples and all echoes, where `measure_begin` ended.
 
-    cleaned: whether the block was changed since.
+    From there again where all echoes show another width. cleaned: whether the block was changed since.
     """
     part = thin_samples(block, NOISE_LOOK)
     more = len(part) > len(thin_samples(block, FIRST_LOOK))
-    if more or cleaned:
-        width = begin.sigma_ref / block.spacing
-        noise = _find_noise(part, width, round(begin.noise.recovery / block.spacing))
-        begin = _gaussian_system(noise, block.spacing, width, begin.saturation)
-    return replace(begin, sigma_ref=_isolated_width(block, begin) * block.spacing)
+    for _ in range(MOST_RETURNS):
+        system, width = begin, begin.sigma_ref / block.spacing
+        if more or cleaned:
+            noise = _find_noise(part, width, round(begin.noise.recovery / block.spacing))
+            system = _gaussian_system(noise, block.spacing, width, begin.saturation)
+        found = _isolated_width(block, system)
+        if abs(found / width - 1) <= FAR_OFF:
+            break
+        begin, cleaned = measure_begin(block, found), False
+    return replace(system, sigma_ref=found * block.spacing)
 
 
 def list_widths(block: WaveformBlock) -> list[float]:
@@ -225,7 +231,10 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     if system.noise.baseline_spread > system.noise.std:
         noise = pooled_noise(block, system)
     echoes = fit_lone(block, noise, system, MIN_SNR)
+    free = (echoes.flags & int(EchoFlag.AT_BOUND)) == 0
     widths, errors = echoes.sigma / block.spacing, echoes.sigma_err / block.spacing
+    if 2 * free.sum() > len(free):
+        widths, errors = widths[free], errors[free]
     if len(widths) < FEW:
         return system.sigma_ref / block.spacing
     return float(np.clip(find_edge(widths, errors), 0.5, 50.0))
