@@ -128,6 +128,7 @@ RUNS = [
     (f"{RUN} --scheduler ''", 2, "--scheduler: the address is empty"),
     (f"{RUN} --scheduler ' '", 2, "--scheduler: the address is empty"),
     (f"{RUN} --where 'ecko_width < 5'", 2, "--where: character 1: .. no column 'ecko_width'; did you mean 'echo_w"),
+    (f"{RUN} --where 'amp > 3'", 2, "no column 'amp'; did you mean 'amplitude'?"),
     (f"{RUN} --where 'z <'", 2, "--where: character 4: a column or a number is missing"),
     (f"{RUN} --drop-flags RINGING", 2, "--drop-flags: flag 'RINGING' does not exist; did you mean 'RINGING_SUSPECT'"),
     (f"{RUN} --classes 2,x", 2, "'2,x' is no list of numbers"),
@@ -158,6 +159,10 @@ FILES = [
      {"strip.pls": "PulseWavesPulse\0" + "\0" * 300}),
     ("info p.plz", 1, "`pulsezip -i p.plz -o p.pls` .. then `wavebatch import p.pls`",
      {"p.plz": "PulseWavesPulse\0" + "\0" * 300}),
+    ("import strip.las -o x.las", 4, "it is LAS or LAZ, which `wavebatch run` reads\n"),
+    *((f"{words} run/strip.laz", 1, "4, 5, 9 or 10; `wavebatch info` and `stats` read a cloud that wavebatch wrote\n")
+      for words in ("survey", "voxelize --size 1 -o v.npz")),
+    ("survey shares.las", 1, "4, 5, 9 or 10; `wavebatch info` and `stats` read clouds\n"),
     ("info e.las", 1, "it is empty", {"e.las": ""}),
     ("info e.las", 1, "e.las: not a LAS or LAZ file (it does not begin with LASF)\n", {"e.las": "nothing"}),
     ("bench none.las", 1, "none.las"), (f"{SURVEY} -o system.json", 2, "written as TOML; name it system.toml"),
@@ -323,7 +328,8 @@ PICTURES = [
     (f"{WAVEFORM} --show asdff", 2, "must be one of"), (f"{WAVEFORM} --sheet --show asdf", 2, "--show"),
     *((f"{words} {more}", code, why) for words in (HISTOGRAM, MAP) for more, code, why in (
         ("--column amplitud", 2, "did you mean 'amplitude'? Columns of the file: amplitude, echo_flags"),
-        ("--column qqqqqq", 2, "known are amplitude"), ("--column intensity --flags WEEK", 2, "did you mean 'WEAK'"),
+        ("--column qqqqqq", 2, "known are amplitude"), ("--column amp", 2, "did you mean 'amplitude'? Columns"),
+        ("--column intensity --flags WEEK", 2, "did you mean 'WEAK'"),
         ("--column intensity --flags NO_WAVEFORM", 1, "1000 of 1000 points are left out by their flags"))),
     (f"{PROFILE} cloud.laz --statistic mean", 2, "needs a --column; --statistic count needs none"),
     *((f"plot {kind} {cloud} -o p.png --column {column}", code, why) for kind in ("histogram", "map")

@@ -32,11 +32,11 @@ class StageError(RuntimeError):
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """`did you mean 'x'?` where a known word is similar, otherwise the list of known words."""
+    """`did you mean 'x'?` where a known word is similar or begins so, otherwise the list of known words."""
     import difflib
 
     known = list(known)
-    near = difflib.get_close_matches(word, known, 1)
+    near = difflib.get_close_matches(word, known, 1) or [one for one in known if word and one.startswith(word)]
     if near:
         return f"did you mean {near[0]!r}?"
     return f"known are {', '.join(known)}" if known else "none is known"

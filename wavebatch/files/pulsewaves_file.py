@@ -125,7 +125,8 @@ def read_pulse_header(path: Path) -> PulseHeader:
     with reporting_reads(path, remedy="; check name and permissions"), open_regular(path) as file:
         front = file.read(_HEADER_SIZE)
         if not front.startswith(SIGNATURE):
-            raise InputError(f"{path}: not a PulseWaves file (it does not begin with PulseWavesPulse)")
+            remedy = "; it is LAS or LAZ, which `wavebatch run` reads" * front.startswith(b"LASF")
+            raise InputError(f"{path}: not a PulseWaves file (it does not begin with PulseWavesPulse){remedy}")
         if len(front) < _HEADER_SIZE:
             raise damaged(path, f"a header of {len(front)} bytes instead of {_HEADER_SIZE}")
         (_, _, major, minor, header_size, start, count, form, attributes, length, compression, _, records, appended,

@@ -69,7 +69,9 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
             restore = f"laszip -i {path.name} -o {path.stem}_restored.las"
             raise InputError(f"{path}: written in LAStools' LAS 1.4 compatibility mode; restore it first: {restore}")
         if number not in WAVEFORM_FORMATS:
-            raise InputError(f"{path}: point format {number} has no waveforms; wavebatch needs format 4, 5, 9 or 10")
+            cloud = "a cloud that wavebatch wrote" if header.generating_software.startswith(b"wavebatch") else "clouds"
+            raise InputError(f"{path}: point format {number} has no waveforms, which need format 4, 5, 9 or 10; "
+                             f"`wavebatch info` and `stats` read {cloud}")  # fmt: skip
         both = las.WAVES_INTERNAL | las.WAVES_EXTERNAL
         if header.global_encoding & both == both:
             raise InputError(
