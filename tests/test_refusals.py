@@ -165,8 +165,11 @@ FILES = [
     ("survey shares.las", 1, "4, 5, 9 or 10; `wavebatch info` and `stats` read clouds\n"),
     ("info e.las", 1, "it is empty", {"e.las": ""}),
     ("info e.las", 1, "e.las: not a LAS or LAZ file (it does not begin with LASF)\n", {"e.las": "nothing"}),
-    ("bench none.las", 1, "none.las"), (f"{SURVEY} -o system.json", 2, "written as TOML; name it system.toml"),
-    (f"{SURVEY} -o system.txt", 2, "written as TOML; name it system.toml"),
+    ("bench none.las", 1, "none.las"), (f"{SURVEY} -o system.json", 2, "'system.json' must end in .toml; .. such as system.toml;"),
+    (f"{SURVEY} --chain chain.json", 2, "such as chain.toml;"),
+    *((f"{words} x.txt", 2, f"'x.txt' must end in .{end}; choose another name, such as x.{end};") for words, end in (
+        ("stats cloud.laz -o", "csv"), ("compare cloud.laz cloud.laz -o", "csv"), (f"{RUN} --html", "html"),
+        ("simulate flat -o s.laz --truth", "npz"))),
     *((f"{words} empty", 2, "no .las or .laz file; --recursive takes those of") for words in ("check", "stats")),
     *((f"{words.format(name)}", 1, name, {"x.las": "no strip"}) for name in ("x.las", "none.las") for words in (
         "voxelize {} -o v.npz --size 1", f"{HISTOGRAM} --column z {{}}", f"{MAP} --column z {{}}")),
@@ -262,7 +265,7 @@ TOOLS = [
     (f"{SURVEY} --divergence 0.5 --angles a.csv", 1, "which width a surface has that faces the sensor"),
     (f"{SURVEY} other.las --divergence 0.5 --angles a.csv", 2, "is for one strip"),
     (f"{CALIBRATE} t.csv --chain c --profile auto", 2, "--chain and --profile exclude each other"),
-    ("calibrate strip.las --targets t.csv -o cal.csv", 2, "written as TOML; name it cal.toml"),
+    ("calibrate strip.las --targets t.csv -o cal.csv", 2, "such as cal.toml"),
     (f"{CALIBRATE} t.csv --lever-arm 1,2,3", 2, "--lever-arm is of no use without --trajectory"),
     (f"{CALIBRATE} t.csv --attenuation .1 --wavelength 532", 2, EXCLUDED),
     ("calibrate strip.las -o c.toml", 2, "give --targets FILE, or --from-column NAME"),
@@ -371,7 +374,7 @@ PICTURES = [
 ]  # fmt: skip
 RASTERS = [
     (GRID, 2, "needs a --column"), (f"{GRID} --column amplitud", 2, "did you mean 'amplitude'"),
-    ("grid cloud.laz --column z -o x.png", 2, "use .tif"), (f"{GRID} --column z --size 0", 2, "not in the range 0<x"),
+    ("grid cloud.laz --column z -o x.png", 2, "such as x.tif"), (f"{GRID} --column z --size 0", 2, "not in the range 0<x"),
     (f"{GRID} --column z --crs EPSG:4978", 2, "geocentric"),
     (f"{GRID} --column z --crs EPSG:0", 2, "write the code of a CRS"),
     (f"{GRID} --statistic count --crs EPSG:99999", 2, "; write the code of a CRS, e.g. EPSG:32632\n"),

@@ -21,7 +21,8 @@ def files(tmp_path_factory):
         simulate_strip("flat", folder / name, pulses=200, seed=1, options=StripOptions(internal=False))
     made = run_command("survey", folder / "s.las", "-o", folder / "sys.toml", "--chain", folder / "chain.toml")
     assert made.exit_code == 0
-    (folder / "list.txt").write_text("s.las\n")
+    for name in ("list.txt", "list.csv"):
+        (folder / name).write_text("s.las\n")
     (folder / "targets.csv").write_text("reflectance,x,y,radius\n0.5,0,0,5\n")
     (folder / "areas.json").write_text('{"type": "FeatureCollection", "features": []}')
     (folder / "energy.txt").write_text("time energy\n0 1\n1e9 1\n")
@@ -71,7 +72,7 @@ _CASES = [
     "synthesize s.las -o hard.las --overwrite",
     "stats s.las -o s.las --overwrite",
     "stats @list.txt -o s.las --overwrite",
-    "stats @list.txt -o list.txt --overwrite",
+    "stats @list.csv -o list.csv --overwrite",
     "stats s.las --area 5 -o link.las --overwrite",
     "stats s.las --polygon areas.json -o areas.json --overwrite",
     "calibrate s.las --targets targets.csv -o targets.csv --overwrite",

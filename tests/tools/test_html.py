@@ -139,15 +139,15 @@ def test_the_sums_of_a_page_hold_with_points_left_out(points, tiny_strip, tmp_pa
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("no/such/r.html", "does not exist; make it first"), ("out/second.laz", "choose another name"),
-     ("in/second.las", "input"), ("notes.txt", "is no report of wavebatch")],
+    [("no/such/r.html", "does not exist; make it first"), ("out/second.laz", "must end in .html"),
+     ("notes.html", "is no report of wavebatch")],
 )  # fmt: skip
 def test_a_page_replaces_only_a_page(flight, name, words):
-    (flight / "notes.txt").write_text("mine")
+    (flight / "notes.html").write_text("mine")
     result = _run("run", flight / "in" / "second.las", "-o", flight / "out", "--resume", "--html", flight / name,
                   code=2)  # fmt: skip
     assert words in result.stderr and result.stderr.count("\n") == 1
-    assert (flight / "notes.txt").read_text() == "mine"
+    assert (flight / "notes.html").read_text() == "mine"
 
 
 def test_a_page_that_cannot_be_drawn_hides_neither_clouds_nor_survey(tiny_strip, tmp_path, monkeypatch):

@@ -76,7 +76,6 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, report, html_file)):
             refuse_input(target)
-    shared.check_toml(output)
     for target in filter(None, (output, report)):
         refuse_existing(target, overwrite)
     shared.check_html(html_file)

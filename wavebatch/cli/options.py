@@ -33,7 +33,19 @@ _Options = TypeVar("_Options")
 
 
 class OutputPath(click.Path):
-    """The type of every option that names a file or folder to write; `click.Path` is that of files to read."""
+    """The type of every option that names a file or folder to write; `click.Path` is that of files to read.
+
+    Where the help names an ending (FILE.csv), the file must have it: programs choose by it how to read a file. It may
+    go on (.tiff).
+    """
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path."""
+        ending = "" if param is None else Path(param.metavar or "").suffix
+        if not Path(value).suffix.lower().startswith(ending):
+            name = Path(value).stem + ending
+            self.fail(f"{str(value)!r} must end in {ending}; choose another name, such as {name}", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 def file_option(*names: str, text: str, metavar: str = "FILE", **more: Any) -> Callable:
@@ -226,7 +238,7 @@ selection_options = together(
 
 html_option = output_option(
     "Also write a report page: one HTML file with all pictures in it. An older report of that name is replaced.",
-    "FILE", "--html", "html_file", required=False,
+    "FILE.html", "--html", "html_file", required=False,
 )  # fmt: skip
 
 
@@ -332,18 +344,6 @@ def common_options(*names: str, failure: int = 1) -> Callable:
         return together(*(_COMMON[name] for name in shared))(report_errors(call, failure))
 
     return decorate
-
-
-_NO_TOML = (".json", ".csv", ".txt", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
-
-
-def check_toml(target: Path | None) -> None:
-    """Raises ConfigError for an input, and for a name that says that another kind of file would be written."""
-    if target is not None:
-        refuse_input(target)
-    if target is not None and target.suffix.lower() in _NO_TOML:
-        more = "; --json prints the figures" if target.suffix.lower() == ".json" else ""
-        raise ConfigError(f"{target}: this file is written as TOML; name it {target.with_suffix('.toml').name}{more}")
 
 
 def given_options(options: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:

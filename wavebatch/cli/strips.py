@@ -147,7 +147,7 @@ _output = shared.output_option("Strip to write: .las or .laz.")
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
 @click.argument("scene", shell_complete=complete_scenes)
 @_output
-@shared.output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
+@shared.output_option("Write the true echoes.", "FILE.npz", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")
 @shared.seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
 @shared.options_of(Recording, default=None)

@@ -71,7 +71,6 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
     angles, html_file, overwrite = options["angles"], options["html_file"], options["overwrite"]
     paths = shared.find_inputs(strips, recursive=options["recursive"])
     for target in (output, chain_file):
-        shared.check_toml(target)
         if target is not None:
             check_target(target, overwrite=overwrite)
     shared.check_html(html_file)
