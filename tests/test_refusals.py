@@ -65,7 +65,7 @@ USAGE = [
     ("plot mpa", 2, "no command 'mpa'; did you mean 'map'? see `wavebatch plot --help`"),
     ("plot histgram cloud.laz", 2, "did you mean 'histogram'?"),
     ("run a.las", 2, "missing option '-o' / '--output'; see `wavebatch run --help`"),
-    ("run a.las -o d --crs", 2, "option '--crs' requires an argument"),
+    ("run a.las -o d --crs", 2, "option '--crs' requires an argument; see `wavebatch run --help`\n"),
     ("check", 2, "error: "),
     ("stages decomposer", 2, "did you mean"),
     ("stages detect.maximun", 2, "did you mean 'detect.maximum'"),
@@ -165,7 +165,8 @@ FILES = [
     ("survey shares.las", 1, "4, 5, 9 or 10; `wavebatch info` and `stats` read clouds\n"),
     ("info e.las", 1, "it is empty", {"e.las": ""}),
     ("info e.las", 1, "e.las: not a LAS or LAZ file (it does not begin with LASF)\n", {"e.las": "nothing"}),
-    ("bench none.las", 1, "none.las"), (f"{SURVEY} -o system.json", 2, "'system.json' must end in .toml; .. such as system.toml;"),
+    ("bench none.las", 1, "none.las"),
+    (f"{SURVEY} -o system.json", 2, "'system.json' must end in .toml; .. such as system.toml;"),
     (f"{SURVEY} --chain chain.json", 2, "such as chain.toml;"),
     *((f"{words} x.txt", 2, f"'x.txt' must end in .{end}; choose another name, such as x.{end};") for words, end in (
         ("stats cloud.laz -o", "csv"), ("compare cloud.laz cloud.laz -o", "csv"), (f"{RUN} --html", "html"),
@@ -374,7 +375,8 @@ PICTURES = [
 ]  # fmt: skip
 RASTERS = [
     (GRID, 2, "needs a --column"), (f"{GRID} --column amplitud", 2, "did you mean 'amplitude'"),
-    ("grid cloud.laz --column z -o x.png", 2, "such as x.tif"), (f"{GRID} --column z --size 0", 2, "not in the range 0<x"),
+    ("grid cloud.laz --column z -o x.png", 2, "such as x.tif"),
+    (f"{GRID} --column z --size 0", 2, "not in the range 0<x"),
     (f"{GRID} --column z --crs EPSG:4978", 2, "geocentric"),
     (f"{GRID} --column z --crs EPSG:0", 2, "write the code of a CRS"),
     (f"{GRID} --statistic count --crs EPSG:99999", 2, "; write the code of a CRS, e.g. EPSG:32632\n"),

@@ -360,7 +360,8 @@ class ProgramCommand(click.Command):
         is_real = not ctx.resilient_parsing and {"-h", "--help"}.isdisjoint(args)
         if is_real:
             read_settings(self, self.title, ctx, args)
-        rest = super().parse_args(ctx, args)
+        with click.core.augment_usage_errors(ctx):  # click names no command where a value is missing
+            rest = super().parse_args(ctx, args)
         for option in self.params:
             value = ctx.params.get(option.name or "")
             for number in value if isinstance(value, tuple) else (value,):
