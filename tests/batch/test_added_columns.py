@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from commands import run_command
 
 import wavebatch as wb
+from wavebatch.batch.options import OPTIONS
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
@@ -18,6 +20,7 @@ def test_every_column_that_a_stage_makes_can_be_asked_for(column):
     if column.startswith("skew"):  # of decomposers that no shipped chain has
         with pytest.raises(wb.ConfigError, match="fits no skew per echo; put decompose.skewed .* --chain"):
             with_columns(chain, [column])
+        assert "skew needs a chain file" in OPTIONS["columns"].words.help
         return
     full = with_columns(chain, [column])
     assert column in full.makes  # and Chain has checked that what its stages need comes before them
@@ -47,6 +50,9 @@ def test_a_column_that_was_asked_for_and_has_no_value_is_a_warning(tiny_strip, t
     assert "not calibrated; give --calibration" in warnings["cross_section"].text
     assert "`wavebatch survey STRIP --divergence MRAD -o SYSTEM.toml`" in warnings["incidence_angle"].text
     assert not [line for line in result.outcomes[0].report.remarks if "none of" in line]
+    words = ("run", tiny_strip, "-o", tmp_path, "--overwrite", "-q", "--profile", "fast", "--fail-on", "no-value")
+    for columns, code in (("+cross_section", 3), ("+range", 0)):
+        assert run_command(*words, "--columns", columns).exit_code == code
 
 
 @pytest.mark.parametrize("column", ["range", "relative_backscatter", "relative_reflectance", "cross_section"])

@@ -178,7 +178,7 @@ class RunOptions:
     )
     columns: str | None = option(
         None, "a,b writes only these columns; +a,+b adds them to the usual ones. The automatic chain and the shipped "
-        "ones get the stages that make them.", OUTPUT, "LIST", usual=True,
+        "ones get the stages that make them; skew needs a chain file.", OUTPUT, "LIST", usual=True,
     )  # fmt: skip
     names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"] = option(
         "wavebatch", "Naming scheme for names and units of the extra bytes.", OUTPUT

@@ -171,6 +171,7 @@ def assemble_echoes(
     Notes
     -----
     A return that no echo of its packet matches is passed through with a flag, so that no return of the vendor is lost.
+    Index -1 means none: `np.append(x, y)[index]` gives y there, the last element.
     """
     if np.any((unit.packet_of_point >= 0) != (unit.point_flags == 0)):
         raise _bug(unit, "a point has neither a packet nor a reason for that")

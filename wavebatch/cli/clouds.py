@@ -139,10 +139,10 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
     found |= {"points": part.points, "pulses": part.pulses, "returns_per_pulse": part.returns_per_pulse}
     found |= {f"return_{k}": part.by_number.get(k, 0.0) for k in range(1, 1 + most_number)}
     found |= {f"pulses_with_{k}": part.by_count.get(k, 0.0) for k in range(1, 1 + most_count)}
-    ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in returns.RANKS)]
-    # A cloud has more classes above the third than RANKS, which are joined here.
+    ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in returns.AREA_RANKS)]
+    # A cloud has more classes above the third than AREA_RANKS, which are joined here.
     unknown = returns.Separation(0, math.nan, math.nan)
-    apart = {pair: part.separations.get(pair, unknown) for pair in returns.RANKS[:-1]}
+    apart = {pair: part.separations.get(pair, unknown) for pair in returns.AREA_RANKS[:-1]}
     rest = [one for name, one in part.separations.items() if name not in (*apart, "all") and one.pairs]
     pairs, least = sum(one.pairs for one in rest), min((one.least for one in rest), default=math.nan)
     others = returns.describe_pairs(pairs, sum(one.pairs * one.mean for one in rest), least)
@@ -152,7 +152,7 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
     found |= describe_record(part)
     # Distances are collected per cloud only: a histogram per area would need too much memory.
     zones = {} if is_area else part.dead_zones
-    for end, name in zip(ends, ("all", *returns.RANKS), strict=True):
+    for end, name in zip(ends, ("all", *returns.AREA_RANKS), strict=True):
         zone = zones.get(name, returns.DeadZone(0, math.nan, math.nan))
         found |= {f"dead_zone_m{end}": zone.size, f"dead_zone_err_m{end}": zone.error}
     return found

@@ -143,7 +143,8 @@ def compare_levels(own: Level, rest: list[Level], noise: float, most: float = ST
         return f"its level is {own.mean:.2f} DN, that of the others {mean:.2f} "
     std = float(np.sqrt(np.average([level.std**2 for level in rest], weights=weights)))
     ratio = own.std / std
-    # Quiet samples of one waveform are correlated: a tenth of them count.
+    # Quiet samples of one waveform are correlated, so that a tenth of them count. The standard deviation of n free
+    # samples has a relative error of sqrt(1 / (2 n)).
     if abs(log(ratio)) > max(log(most), STRANGE / np.sqrt(0.2 * own.samples)):
         return f"its noise is {own.std:.2f} DN, that of the others {std:.2f}"
     clips = {level.clip for level in rest if level.clip is not None}
@@ -154,7 +155,7 @@ def compare_levels(own: Level, rest: list[Level], noise: float, most: float = ST
 
 @frozen(eq=False)
 class Glance:
-    """What a look finds before it tries the flight's pulse, in most of its time."""
+    """What a look finds before it tries the flight's pulse; most of a look's time goes into this."""
 
     plain: SystemPulse
     """A Gaussian, and the noise."""
@@ -168,7 +169,7 @@ def glance_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Glance | 
     block = _pool_main(blocks, system)
     if block is None:
         return None
-    # With the flight's width this takes half as long as to measure one; where echoes contradict it, it is done.
+    # With the flight's width this takes half as long as with a measured one, which only echoes of another width need.
     plain = measure_quiet(block, system.sigma_ref / block.spacing)
     for measured in False, True:
         if measured:

@@ -129,7 +129,7 @@ class PolygonSet(Division):
         return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
 
-RANKS = ("1-2", "2-3", "3-4", "4-")
+AREA_RANKS = ("1-2", "2-3", "3-4", "4-")
 """Classes of pairs of consecutive returns per area and of dead zones.
 
 They count by the number of the first return; the last class holds all higher numbers.
@@ -203,7 +203,7 @@ class AreaTally:
     always: numbers of areas that count also without a pulse.
     """
 
-    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS, always: Sequence[int] = ()) -> None:
+    def __init__(self, division: Division, ranks: tuple[str, ...] = AREA_RANKS, always: Sequence[int] = ()) -> None:
         self.division, self._ranks, n = division, ranks, len(ranks)
         quantities = [("by_number", "i8", (MOST_NUMBER + 1,)), ("by_count", "i8", (MOST_COUNT + 1,)),
                       ("pairs", "i8", (n,)), ("apart", "f8", (n,)), ("least", "f8", (n,)), ("several", "i8"),
@@ -332,7 +332,7 @@ def find_dead_zone(bins: np.ndarray) -> DeadZone:
     return DeadZone(pairs, round(edge * BIN, 2), round(max(rank * gap, BIN), 3))
 
 
-_RANKS = (*(f"{k}-{k + 1}" for k in range(1, 15)), "15-")
+_WHOLE_RANKS = (*(f"{k}-{k + 1}" for k in range(1, 15)), "15-")
 """Classes of pairs of whole clouds."""
 
 _NOT_A_TIME = np.uint64(0x7FF8 << 48)
@@ -490,9 +490,9 @@ class _Tally:
     """Those of `incomplete` with more points of one time than stored in them."""
     depth: float = 0.0
     methods: set[str] = field(default_factory=set)
-    distances: np.ndarray = field(default_factory=lambda: np.zeros((len(RANKS), BINS), np.int64))
-    """Histograms of the distances between consecutive returns, one per class of RANKS."""
-    whole: AreaTally = field(default_factory=lambda: AreaTally(PolygonSet(()), _RANKS, (_OUTSIDE,)))
+    distances: np.ndarray = field(default_factory=lambda: np.zeros((len(AREA_RANKS), BINS), np.int64))
+    """Histograms of the distances between consecutive returns, one per class of AREA_RANKS."""
+    whole: AreaTally = field(default_factory=lambda: AreaTally(PolygonSet(()), _WHOLE_RANKS, (_OUTSIDE,)))
     """All of the cloud lies outside of no polygons."""
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
@@ -527,7 +527,7 @@ class _Tally:
             distance = np.linalg.norm((rows["xyz"][before + 1] - rows["xyz"][before]) * self.metres, axis=1)
         known = np.isfinite(distance)
         before, distance = before[known], distance[known]
-        rank = np.minimum(rows["number"][before].astype(np.int64), len(RANKS)) - 1
+        rank = np.minimum(rows["number"][before].astype(np.int64), len(AREA_RANKS)) - 1
         np.add.at(self.distances, (rank, np.minimum(distance / BIN, BINS - 1).astype(np.int64)), 1)
         for area in (self.whole, *self.areas):
             area.add(rows, first, (before, distance), depths)
@@ -550,7 +550,7 @@ class _Tally:
         (whole,) = self.whole.finish()
         bins = self.distances
         zones = {"all": find_dead_zone(bins.sum(axis=0))}
-        zones |= {name: find_dead_zone(each) for name, each in zip(RANKS, bins, strict=True) if each.any()}
+        zones |= {name: find_dead_zone(each) for name, each in zip(AREA_RANKS, bins, strict=True) if each.any()}
         zone = zones["all"].size
         # Pairs that the zone would hold if they were as frequent there as up to twice its size.
         above = slice(0, 0) if math.isnan(zone) else slice(round(zone / BIN), round(2 * zone / BIN))

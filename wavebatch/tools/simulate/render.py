@@ -286,7 +286,7 @@ class Recording:
     """How the simulated receiver records: window, levels, noise and system pulse."""
 
     n_samples: Annotated[int, Range(8, MAX_SAMPLES)] = option(
-        80, "Samples per waveform.", name="samples", unset="the scene's, 80 or 96"
+        80, "Samples per waveform.", form="N", name="samples", unset="the scene's, 80 or 96"
     )
     spacing: Annotated[float, Range(0.001, 4000.0)] = option(
         1.0, "Time between samples [ns].", form="NS", unset="1"

@@ -301,7 +301,9 @@ class DiscreteReceiver(CheckedOptions):
     threshold: Annotated[float, Range(0.0, 1e10)] = option(
         12.0, "Discrete: amplitude that triggers a return [DN].", form="DN", unset="12"
     )
-    most: Annotated[int, Range(1, 15)] = option(4, "Discrete: most returns per pulse.", name="most-returns", unset="4")
+    most: Annotated[int, Range(1, 15)] = option(
+        4, "Discrete: most returns per pulse.", form="N", name="most-returns", unset="4"
+    )
 
     def list_returns(self, truth: EchoTable, n: int) -> Returns:
         """The returns that the echoes of n pulses fire."""

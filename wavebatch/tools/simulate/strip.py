@@ -154,8 +154,10 @@ class StripOptions(CheckedOptions):
         None, "LAS version.", name="las-version", unset="1.3 for point formats 4 and 5, else 1.4"
     )
     internal: bool = option(True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal")
-    scale: Annotated[float, Range(1e-5, 1.0)] = option(0.001, "Unit of the stored coordinates [m].")
-    without_waveform: Annotated[float, Range(0.0, 1.0)] = option(0.01, "Share of the pulses without a packet.")
+    scale: Annotated[float, Range(1e-5, 1.0)] = option(0.001, "Unit of the stored coordinates [m].", form="M")
+    without_waveform: Annotated[float, Range(0.0, 1.0)] = option(
+        0.01, "Share of the pulses without a packet.", form="SHARE"
+    )
     keep_empty: bool = option(True, "Keep or leave out pulses without an echo.", opposite="drop-empty", unset="keep")
     toward: bool = option(
         True, "Direction of the packet vectors: toward or away from the sensor.", opposite="away", unset="toward"
