@@ -157,6 +157,7 @@ def test_the_sensor_that_a_pulse_looks_like_is_named(riegl, flat_strip, tmp_path
     sentence = "this strip's pulse looks like RIEGL LMS-Q680i; it differs by "
     used = "RIEGL LMS-Q680i: its shipped pulse is used"
     assert any(line.startswith("sensor") and used in line for line in _survey(riegl).stdout.splitlines())
+    assert "system pulse      sum of 5 Gaussians; " in _survey(riegl).stdout, "it was not learned here"
     small = _survey(cut_strip(riegl, tmp_path / "small.las", 11)).stdout
     assert used in small and "riegl-q680i: " in small
     assert "looks like" not in _survey(flat_strip).stdout

@@ -104,7 +104,7 @@ def _describe(survey: Survey) -> Iterator[tuple[str, str]]:
 def name_model(system: SystemPulse) -> str:
     """The kind of pulse that is fitted."""
     if system.components:
-        return f"learned, {len(system.components)} Gaussians"
+        return f"sum of {len(system.components)} Gaussians"
     return f"skewed, kappa {system.kappa:.4f}" if system.kappa else "Gaussian"
 
 
