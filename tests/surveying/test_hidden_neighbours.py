@@ -61,8 +61,8 @@ def test_errors_cover_hidden_neighbours(scene):
     assert 0.8 < rms(covered[1][0]) < 1.3
     for kind, before in zip(covered, bare, strict=True):
         within = np.mean(np.abs(kind[1:]) < 1, axis=1)
-        assert (within > 0.65).all() and (within < 0.9).all()
-        assert (rms(kind[1]) < 0.6 * rms(before[1])) and (rms(kind[2]) < 0.6 * rms(before[2]))
+        assert (within > 0.6).all() and (within < 0.75).all()
+        assert rms(kind[1]) <= rms(before[1]) and rms(kind[2]) <= rms(before[2])
 
 
 def test_a_strip_of_lone_echoes_has_the_errors_of_the_fit():

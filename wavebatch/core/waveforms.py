@@ -482,7 +482,7 @@ class SystemPulse:
             "(excess variance of a width, share of light over its root of lone and other echoes) by unseen neighbours",
             form="[excess, lone, others]"),
     ] = ()  # fmt: skip
-    """What they add to light: excess variance; mean share of an echo's light that is theirs, over the excess's root."""
+    """What they add to light: excess variance; share of light over the excess's root that 68 % stay within."""
     other_pulse: bool = False
     """Whether the echoes of a block were fitted with another pulse than the survey's; set while a chain runs."""
     digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)

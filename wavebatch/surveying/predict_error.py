@@ -188,6 +188,9 @@ NEAR, FAR = 2.5, 4.0
 """Distances, in widths of the system pulse, from which pairs are found nearly always, and up to which as many echoes
 lie in a step of distance as nearer. Pairs are simulated up to FAR."""
 
+BEYOND = 0.3173
+"""Share of normal values beyond one standard deviation."""
+
 CLEAR = 10.0
 """Least amplitude over noise of echoes whose widths are counted."""
 
@@ -240,7 +243,8 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
 def _measure_class(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, number: np.ndarray, company: bool
 ) -> np.ndarray:
-    """Mean square of the shift over the excess variance, and mean share of others' light over its root (2, classes).
+    """Mean square of the shift over the excess variance, and the share of others' light over its root that BEYOND of
+    all echoes exceed (2, classes).
 
     Of echoes with (company) or without another in their waveform. number: echoes in the waveform of each. An echo that
     hides another was in a waveform with one more.
@@ -264,9 +268,15 @@ def _measure_class(
     there = np.histogram(excess_variance(echoes.take(np.flatnonzero(clear)), system), EXCESS)[0]
     hidden = expected * np.histogram(excess, EXCESS)[0]
     least = np.maximum(excess, EXCESS[0])
-    weights = shift**2 / least, np.abs(light) / np.sqrt(least)
-    sums = expected * np.stack([np.histogram(excess, EXCESS, weights=weight)[0] for weight in weights])
-    return sums / np.maximum(np.maximum(there, hidden), 1.0)
+    number = np.maximum(np.maximum(there, hidden), 1.0)
+    late = expected * np.histogram(excess, EXCESS, weights=shift**2 / least)[0] / number
+    # Of all echoes of a class, those that hide nothing too, as many have more light of others as beyond one deviation.
+    place, share = np.digitize(excess, EXCESS) - 1, np.abs(light) / np.sqrt(least)
+    beyond = np.zeros(len(number))
+    for kind, most in enumerate(BEYOND * number / expected):
+        ordered = np.sort(share[place == kind])[::-1]
+        beyond[kind] = ordered[int(most)] if most < len(ordered) else 0.0
+    return np.stack([late, beyond])
 
 
 def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[np.ndarray, ...]:

@@ -403,7 +403,7 @@ def measure_covariance(
     float64 (k,) or None
         k <= 1 + MOST_LAGS. None where fewer than LEAST_QUIET_PAIRS neighbours are quiet.
     """
-    alone = np.where(quiet, np.asarray(signal, np.float32), np.float32(np.nan))
+    alone = np.ascontiguousarray(np.where(quiet, np.asarray(signal, np.float32), np.float32(np.nan)))
     marks = None if mirrored is None else np.ascontiguousarray(mirrored[0] + np.uint8(2) * mirrored[1])
     half: list[float] = []
     pairs: list[float] = []

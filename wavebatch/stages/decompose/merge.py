@@ -115,8 +115,8 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
     -----
     An echo that hides another is wider than the pulse. Among echoes of one width the root mean square of their errors
     is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2). Amplitudes and energies get
-    the mean instead: few echoes have a third of their light from another target, and the root mean square would be the
-    error of hardly any. Column 1 of both tables is of lone echoes, column 2 of others.
+    what 68 % of the echoes of a width stay within: few have a third of their light from another target, and the root
+    mean square would be the error of hardly any. Column 1 of both tables is of lone echoes, column 2 of others.
     """
     if not system.hidden:
         return table
