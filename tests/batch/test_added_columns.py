@@ -18,7 +18,7 @@ MADE = sorted({name for stage in STAGES.values() if stage.kind == "attribute" fo
 def test_every_column_that_a_stage_makes_can_be_asked_for(column):
     chain = load_profile("fast")
     if column.startswith("skew"):  # of decomposers that no shipped chain has
-        with pytest.raises(wb.ConfigError, match="fits no skew per echo; put decompose.skewed .* --chain"):
+        with pytest.raises(wb.ConfigError, match="put decompose.skewed .* and add stage attribute.skew, .* false"):
             with_columns(chain, [column])
         assert "skew needs a chain file" in OPTIONS["columns"].words.help
         return
@@ -51,7 +51,7 @@ def test_a_column_that_was_asked_for_and_has_no_value_is_a_warning(tiny_strip, t
     assert "`wavebatch survey STRIP --divergence MRAD -o SYSTEM.toml`" in warnings["incidence_angle"].text
     assert not [line for line in result.outcomes[0].report.remarks if "none of" in line]
     words = ("run", tiny_strip, "-o", tmp_path, "--overwrite", "-q", "--profile", "fast", "--fail-on", "no-value")
-    for columns, code in (("+cross_section", 3), ("+range", 0)):
+    for columns, code in (("+cross_section", 3), ("+cross_section_err", 3), ("+range", 0)):
         assert run_command(*words, "--columns", columns).exit_code == code
 
 

@@ -11,6 +11,7 @@ import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Sensor, write_strip
 from tests.surveying.test_calibration_misuse import BASE, GROUND, LIGHT, call, fields, write_targets
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
+from wavebatch.surveying.matching.strip_energies import _compare_unknown
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -127,6 +128,18 @@ def test_pulses_whose_energy_is_not_logged_have_an_error_by_their_light(tmp_path
     unknown = stated > np.median(stated) + 0.01
     assert 0.3 < unknown.mean() < 0.5 and np.median(stated[unknown]) == pytest.approx(error, abs=0.03)
     assert np.mean(np.abs(off / (1 + off))[unknown] < 1.1 * stated[unknown]) > 0.6
+
+
+def test_light_of_unknown_pulses_is_compared_within_each_digitizer(rng):
+    """Whatever the scales of two digitizers are; one without known energies has nothing to compare with."""
+    light, gone, second = rng.lognormal(5, 0.3, 4000), rng.uniform(size=4000) < 0.3, np.arange(4000) % 2
+    light, energy = np.where(gone, 0.75 * light, light), np.where(gone, np.nan, 1.0)
+    one = np.stack([np.arange(4000), light, energy, np.zeros(4000)])
+    two = np.stack([np.arange(4000), np.where(second, 257 * light, light), energy, 4 * second])
+    (error, alone), (same, none) = _compare_unknown(one, 0.03), _compare_unknown(two, 0.03)
+    assert same == pytest.approx(error, abs=0.03) and error == pytest.approx(1 / 3, abs=0.05) and alone == none == 0
+    two[2] = np.where(second, np.nan, 1.0)
+    assert _compare_unknown(two, 0.03) == (0.0, 0.5)
 
 
 @pytest.mark.slow

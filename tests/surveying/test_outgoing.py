@@ -47,6 +47,7 @@ def test_recordings_without_a_pulse_have_no_energy(rng):
     found = measure_outgoing(np.concatenate([samples, noise]), reference)
     assert np.isfinite(found.energy[:200]).all() and np.isnan(found.energy[200:]).all()
     assert learn_shape(noise, 1.0, reference) is None
+    assert measure_outgoing(samples[:, :1], reference).energy.shape == (200,)  # one sample each
 
 
 @pytest.fixture

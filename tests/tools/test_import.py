@@ -142,6 +142,23 @@ def test_clipped_outgoing_pulses_have_a_time_but_no_energy(tmp_path, rng):
     assert np.sqrt(np.median(error[lost]) ** 2 - np.median(error[~lost]) ** 2) > 0.1
 
 
+def test_pulses_of_another_digitizer_are_counted_apart_and_not_compared(tmp_path, rng):
+    """Their counts were compared with those of the others: 15436 % of error held what is another scale."""
+    pulses = list(_sent(rng, 800, 180, 0.5))
+    for pulse in pulses[::4]:
+        pulse.descriptor, pulse.waves = 2, [[(at, 200 * samples)] for ((at, samples),) in pulse.waves]
+    kinds = {1: (SENT, ECHO), 2: (replace(SENT, bits=16), replace(ECHO, bits=16))}
+    found = import_file(PulseFile(kinds, pulses).write(tmp_path / "a.pls"), tmp_path / "o.las", ImportOptions())
+    assert (found.outgoing["unknown"], found.outgoing["other_kind"]) == (0, 200)
+    (note,) = [note for note in found.notes if "outgoing pulses" in note]
+    assert note.startswith("200 outgoing pulses are recorded with another channel, bits or spacing")
+    cloud, said = _run(tmp_path, "--columns", "+amplitude_normalized,+amplitude_normalized_err", "--flight-height", 151)
+    error = cloud["amplitude_normalized_err"] / cloud["amplitude_normalized"]
+    lost = np.isnan(cloud["pulse_energy"])
+    assert "25% of all are not compared" in said and "of error hold it" not in said
+    assert np.sqrt(np.median(error[lost]) ** 2 - np.median(error[~lost]) ** 2) == pytest.approx(0.1, abs=0.03)
+
+
 def test_outgoing_pulses_that_are_cut_have_an_error_that_holds(tmp_path, rng):
     pulses = list(_sent(rng, 400, 180, 0.5))
     for pulse in pulses:

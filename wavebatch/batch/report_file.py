@@ -375,8 +375,9 @@ def _explain_columns(prepared: Prepared, report: RunReport) -> tuple[list[str], 
     """Why columns have no value, or few: lines for remarks, and those for warnings: --columns names their column."""
     lines: list[str] = []
     missed: list[str] = []
-    asked = {entry.removeprefix("+") for entry in split_columns(prepared.job.options.columns)}
-    wanted = {*prepared.job.columns, *prepared.needed}
+    # Who asks for the error of a column alone misses the column too.
+    asked = {entry.removeprefix("+").removesuffix("_err") for entry in split_columns(prepared.job.options.columns)}
+    wanted = {name.removesuffix("_err") for name in (*prepared.job.columns, *prepared.needed)}
     for column, counts in sorted(report.no_data.items()):
         if column not in wanted:
             continue

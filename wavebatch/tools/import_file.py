@@ -85,8 +85,8 @@ class ImportSummary:
     covered: int = 0
     """Segments of other channels that the sensitive one recorded as well, unsaturated."""
     outgoing: dict[str, float] | None = None
-    """Of the outgoing pulses: fwhm_ns, energy_scatter, energy_error, width_scatter (relative), and unknown: pulses
-    whose outgoing recording shows no pulse, or clips it."""
+    """Of the outgoing pulses: fwhm_ns, energy_scatter, energy_error, width_scatter (relative), and two numbers of
+    pulses: unknown (whose outgoing recording shows no pulse, or clips it) and other_kind (not measured)."""
     system_file: str | None = None
     notes: tuple[str, ...] = ()
 
@@ -149,6 +149,7 @@ def import_file(
                 "energy_error": sent.error,
                 "width_scatter": sent.width_scatter,
                 "unknown": 0,
+                "other_kind": 0,
             }
         digitizers = [by_index[index] for index in sorted(by_index)]
         extra_bytes = [ExtraRecord.build(FACET, "u1", "mirror facet of the pulse")]
@@ -197,6 +198,11 @@ def import_file(
         notes.append(f"{counts.without_returns} pulses have no returning segment, and so no point")
     if counts.outgoing and counts.outgoing["unknown"]:
         notes.append(f"{counts.outgoing['unknown']} outgoing pulses are clipped or not seen: their energy is not known")
+    if counts.outgoing and counts.outgoing["other_kind"]:
+        notes.append(
+            f"{counts.outgoing['other_kind']} outgoing pulses are recorded with another channel, bits or spacing than "
+            "most: their energy is not known, because counts of two recordings have nothing in common"
+        )
     kinds = {s.kind for one in header.descriptors.values() for s in one.samplings}
     if plan.outgoing is None and kinds - {RETURNING}:
         notes.append("its recordings of outgoing pulses show no pulse, or are clipped")
@@ -472,7 +478,8 @@ def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: ImportSummary) 
     """
     segments = piece.segments
     kind = code_segments(segments, np.arange(len(segments))) & ~((1 << 18) - 1)
-    sent = np.flatnonzero((segments.kind == OUTGOING) & (kind == outgoing.kind) & (segments.length > 2))
+    every = np.flatnonzero((segments.kind == OUTGOING) & (segments.length > 2))
+    sent = every[kind[every] == outgoing.kind]
     sent = sent[np.append(True, np.diff(segments.pulse[sent]) != 0)[: len(sent)]]
     values, late = np.full((4, len(piece.pulses)), np.nan), np.zeros(len(piece.pulses))
     for (rows,) in group_rows(segments, sent):
@@ -484,7 +491,9 @@ def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: ImportSummary) 
         # Without a stored duration the recording has no place on the clock.
         peak = np.where(start != 0, start + (found.time - outgoing.origin) * spacing, 0.0)
         late[pulse] = np.where(np.isfinite(peak), peak, 0.0)
-    counts.outgoing["unknown"] += int(np.count_nonzero(np.isnan(values[0])))
+    other = len(np.setdiff1d(segments.pulse[every], segments.pulse[sent]))
+    counts.outgoing["other_kind"] += other
+    counts.outgoing["unknown"] += int(np.count_nonzero(np.isnan(values[0]))) - other
     return values, late
 
 

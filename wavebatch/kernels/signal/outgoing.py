@@ -160,7 +160,7 @@ def measure_outgoing(samples: np.ndarray, reference: OutgoingReference) -> Outgo
     half = 0.5 * values.max(axis=1)
     sides = []
     for mirrored in (values, values[:, ::-1]):
-        first = np.maximum(np.argmax(mirrored > half[:, None], axis=1), 1)
+        first = np.clip(np.argmax(mirrored > half[:, None], axis=1), min(1, s - 1), None)
         step = np.maximum(mirrored[rows, first] - mirrored[rows, first - 1], 1e-6)
         sides.append(first - (mirrored[rows, first] - half) / step)
     time = np.where(clipped, 0.5 * (sides[0] + (s - 1) - sides[1]), peak + shift)

@@ -40,8 +40,10 @@ def _need_free_skew(step: Step, chain: Chain, system: SystemPulse | None) -> str
     if free or "skew" in decomposer.stage.makes:
         return ""
     return (
-        f'{decomposer.stage.name} fits no skew per echo; put decompose.skewed with kappa = "free" in its place, in '
-        "the file that `wavebatch survey STRIP --chain CHAIN.toml` writes, and give that as --chain"
+        f'{decomposer.stage.name} fits no skew per echo; put decompose.skewed with kappa = "free" in its place and add '
+        "stage attribute.skew, in the file that `wavebatch survey STRIP --chain CHAIN.toml` writes, and give that as "
+        "--chain; it fits pulses that are plain or skewed Gaussians: where the pulse is a sum of Gaussians it finds "
+        "false echoes"
     )
 
 

@@ -44,6 +44,9 @@ pulses one period apart by this share of it at most: surfaces make pulses that l
 LEAST_COMPARED = 200
 """Pairs of pulses that show it."""
 
+LEAST_KNOWN = 20
+"""Pulses of known energy that show how bright a digitizer's are: their median scatters by a quarter of each."""
+
 PLACES, OF_PLACE, LEAST_PLACES = 32, 128, 8
 """Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest."""
 
@@ -127,13 +130,18 @@ def take_energies(
     elif energy is not None and energy.known < 1.0:
         chance = CHANGE_CHANCE if calibration is None else calibration.change_chance
         places = _read_places(reader, scan, replace(energy, fills=None))
-        more = _compare_unknown(np.concatenate([np.empty((4, 0)), *places], axis=1), chance)
+        more, alone = _compare_unknown(np.concatenate([np.empty((4, 0)), *places], axis=1), chance)
         energy = replace(energy, fills=math.hypot(energy.fills or 0.0, more))
-        if more > LEAST_SAID:
+        found = f"by their light beside that of the others, {100 * more:.1f} % of error hold it"
+        others = (
+            f"{alone:.0%} of all are not compared, because their digitizer has too few of known energy, and their "
+            "error holds only how the known energies vary"
+        )
+        said = [text for text, told in ((found, more > LEAST_SAID), (others, alone > LEAST_SAID)) if told]
+        if said:
             notes.append(
-                f"{energy.source}: {1.0 - energy.known:.0%} of the pulses have none and count as of mean energy: by "
-                f"their light beside that of the others, {100 * more:.1f} % of error hold it; --energy "
-                f"{energy.source} gives them no values"
+                f"{energy.source}: {1.0 - energy.known:.0%} of the pulses have none and count as of mean energy: "
+                f"{'; '.join(said)}; --energy {energy.source} gives them no values"
             )
     # By how much the logarithm of the light of neighbouring pulses of one channel differs in turns; 0 where not.
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -220,15 +228,27 @@ def _read_places(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> l
     return found
 
 
-def _compare_unknown(pulses: np.ndarray, chance: float) -> float:
-    """Error of pulses of unknown energy by their light beside that of the others, relative; pulses: as `_join`."""
+def _compare_unknown(pulses: np.ndarray, chance: float) -> tuple[float, float]:
+    """Error of pulses of unknown energy by their light beside that of the others of their digitizer, relative, and the
+    share of pulses that are of unknown energy and have no others there; pulses: as `_join`."""
     with np.errstate(invalid="ignore", divide="ignore"):
         unknown, light = np.isnan(pulses[2]), np.log(pulses[1] / np.nan_to_num(pulses[2], nan=1.0))
-    parts = [light[rows & np.isfinite(light)] for rows in (unknown, ~unknown)]
+    shown, alone = np.isfinite(light), 0
+    # Counts of two digitizers have nothing in common, so each is taken relative to its own pulses of known energy.
+    for channel in np.unique(pulses[3]):
+        own = pulses[3] == channel
+        known = light[own & shown & ~unknown]
+        if len(known) < LEAST_KNOWN:
+            alone += int(np.count_nonzero(own & unknown))
+            shown &= ~own
+        else:
+            light[own] -= np.median(known)
+    share = alone / max(len(light), 1)
+    parts = [light[rows & shown] for rows in (unknown, ~unknown)]
     if min(map(len, parts)) < LEAST_COMPARED:
-        return 0.0
+        return 0.0, share
     change = compare_scenes(*(np.quantile(part, QUANTILES) for part in parts), chance=chance)
-    return math.expm1(max(change.error, abs(change.shift) * (change.chance > LIKELY)))
+    return math.expm1(max(change.error, abs(change.shift) * (change.chance > LIKELY))), share
 
 
 def _compare_drift(places: list[np.ndarray], shots: float) -> float:
