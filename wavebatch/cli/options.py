@@ -35,14 +35,15 @@ _Options = TypeVar("_Options")
 class OutputPath(click.Path):
     """The type of every option that names a file or folder to write; `click.Path` is that of files to read.
 
-    Where the help names an ending (FILE.csv), the file must have it: programs choose by it how to read a file. It may
-    go on (.tiff).
+    Where the help names an ending (FILE.csv), a file has no other one: programs choose by it how to read a file. It may
+    go on (.tiff) or be cut short (.htm).
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path."""
         ending = "" if param is None else Path(param.metavar or "").suffix
-        if not Path(value).suffix.lower().startswith(ending):
+        own = Path(value).suffix.lower()
+        if not (own.startswith(ending) or ending.startswith(own)):
             name = Path(value).stem + ending
             self.fail(f"{str(value)!r} must end in {ending}; choose another name, such as {name}", param, ctx)
         return super().convert(value, param, ctx)
