@@ -240,7 +240,8 @@ def test_a_strip_in_a_folder_is_never_replaced(flight, tmp_path):
     folder, _ = flight
     strip = tmp_path / "a.las"
     strip.write_bytes((folder / "a.las").read_bytes())
-    for options in (("-o", strip), ("-o", tmp_path / "cal.toml", "--report", strip)):
+    for options, reason in ((("-o", strip), "must end in .toml; choose another name"),
+                            (("-o", tmp_path / "cal.toml", "--report", strip), "would replace this input")):
         done = call("calibrate", tmp_path, "--targets", folder / "t.csv", *options, "--overwrite")
-        assert done.exit_code == 2 and "would replace this input" in done.stderr
+        assert done.exit_code == 2 and reason in done.stderr
     assert strip.read_bytes() == (folder / "a.las").read_bytes()
