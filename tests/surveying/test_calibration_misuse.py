@@ -211,8 +211,9 @@ def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibra
     ("change", "said", "growth"),
     [
         ({"rate": 20_000.0, "line_rate": 50.0, "light": 0.5 * LIGHT}, "so another energy: 2e+04", 1.0),
-        ({"light": 0.5 * LIGHT, "noise": 0.3}, "noise of digitizer 1 is [DN] 0.", 1.0),
-        ({"light": 0.5 * LIGHT}, "another gain, or other surfaces: light of digitizer 1", 1.0),
+        ({"light": 0.5 * LIGHT}, "all echoes of digitizer 1 are brighter by a factor of 0.50", 1.0),
+        ({"light": 0.5 * LIGHT, "noise": 0.3, "start": (3000.0, 0.0)}, "noise of digitizer 1 is [DN] 0.", 1.2),
+        ({"light": 0.5 * LIGHT, "start": (3000.0, 0.0)}, "another gain, or other surfaces: light of digitizer 1", 1.2),
     ],
 )
 def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_path, calibrated, change, said, growth):
@@ -222,6 +223,15 @@ def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_pat
     cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
     stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
     assert np.nanmedian(stated) == pytest.approx(growth, abs=0.1)
+
+
+@pytest.mark.slow
+def test_noise_alone_over_ground_in_common_is_sunlight(tmp_path, calibrated):
+    """The ground shows that light is the same: noise twice as large gave 62 % of error."""
+    write_strip(tmp_path / "b.las", GROUND, replace(SENSOR, noise=1.2, time=START + 600), 6000, seed=4)
+    assert "warning" not in run(calibrated, tmp_path / "out", tmp_path / "b.las")
+    cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
+    assert np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]) < 0.06
 
 
 @pytest.mark.quick_cases("0.8")

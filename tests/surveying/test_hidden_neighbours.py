@@ -1,9 +1,12 @@
 """Errors hold neighbours that are too close to be found, as far as the strip's pairs tell."""
 
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import run_command
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
 from wavebatch.core.waveforms import SystemPulse
@@ -17,7 +20,7 @@ ACCURATE = load_profile("accurate")
 
 
 def scaled_errors(scene, system, block, truth):
-    """Errors of clear echoes over the reported ones, of time, amplitude, energy: without a flag, and with one."""
+    """Errors of clear echoes over the reported ones, of time, amplitude, energy and width: without flags, and with."""
     found = ACCURATE.run(block, system)
     match = match_echoes(found, truth)
     clear = truth.amplitude[match.truth] > 10 * find_scene(scene).recording.recorded_noise
@@ -27,6 +30,7 @@ def scaled_errors(scene, system, block, truth):
         (found.time - truth.time[at]) / found.time_err,
         (found.amplitude - truth.amplitude[at]) / found.amplitude_err,
         (1 - truth.amplitude[at] * truth.sigma[at] / energy) / found.relative_energy_err,
+        (found.sigma - truth.sigma[at]) / found.sigma_err,
     ])  # fmt: skip
     flagged = (found.flags & np.uint16(UNCLEAN)) != 0
     return scaled[:, ~flagged], scaled[:, flagged]
@@ -39,10 +43,27 @@ def rms(values):
 def test_what_is_hidden_changes_errors_and_no_echo():
     block, _ = simulate_block("forest", 3000, np.random.default_rng(3))
     system = survey_block(block).system
-    found, bare = (ACCURATE.run(block, one) for one in (system, replace(system, hidden=(), hidden_light=())))
-    for name in ("time", "amplitude", "sigma", "sigma_err", "flags"):
+    found, bare = (ACCURATE.run(block, one) for one in (system, replace(system, hidden=())))
+    for name in ("time", "amplitude", "sigma", "flags"):
         assert np.array_equal(getattr(found, name), getattr(bare, name)), name
-    assert (found.amplitude_err >= bare.amplitude_err).all() and (found.time_err >= bare.time_err).all()
+    for name in ("time_err", "amplitude_err", "relative_energy_err", "sigma_err"):
+        more = getattr(found, name) - getattr(bare, name)
+        assert (more >= 0).all() and more.max() > 0, name
+
+
+def test_a_survey_of_an_earlier_version_is_named(tmp_path):
+    """It has no `hidden_light` and `hidden_width`, so that errors are too small in forests: nothing said so."""
+    strip, system = tmp_path / "f.las", tmp_path / "f.toml"
+    for words in (("simulate", "forest", "-o", strip, "--pulses", 2000), ("survey", strip, "-o", system)):
+        assert run_command(*words).exit_code == 0
+    said = {}
+    for name, text in {"new": system.read_text(), "old": re.sub("(?m)^hidden_.*\n", "", system.read_text())}.items():
+        (tmp_path / f"{name}.toml").write_text(text)
+        done = run_command("run", strip, "-o", tmp_path / name, "--system", tmp_path / f"{name}.toml")
+        assert done.exit_code == 0
+        remarks = json.loads((tmp_path / name / "f.report.json").read_text())["remarks"]
+        said[name] = [line for line in remarks if "an earlier version made this file" in line]
+    assert not said["new"] and "without hidden_light and hidden_width" in said["old"][0]
 
 
 @pytest.mark.slow
@@ -53,7 +74,7 @@ def test_errors_cover_hidden_neighbours(scene):
     for seed in (5, 6, 7):
         block, truth = simulate_block(scene, 5000, np.random.default_rng(seed))
         system = survey_block(block).system
-        bare.append(scaled_errors(scene, replace(system, hidden=(), hidden_light=()), block, truth))
+        bare.append(scaled_errors(scene, replace(system, hidden=()), block, truth))
         covered.append(scaled_errors(scene, system, block, truth))
     bare, covered = ([np.hstack(kind) for kind in zip(*pairs, strict=True)] for pairs in (bare, covered))
     assert min(rms(kind[0]) for kind in bare) > 2
@@ -62,7 +83,7 @@ def test_errors_cover_hidden_neighbours(scene):
     for kind, before in zip(covered, bare, strict=True):
         within = np.mean(np.abs(kind[1:]) < 1, axis=1)
         assert (within > 0.6).all() and (within < 0.75).all()
-        assert rms(kind[1]) <= rms(before[1]) and rms(kind[2]) <= rms(before[2])
+        assert all(rms(kind[row]) <= rms(before[row]) for row in (1, 2, 3))
 
 
 def test_a_strip_of_lone_echoes_has_the_errors_of_the_fit():
@@ -75,6 +96,7 @@ def test_the_cover_is_that_of_a_loop(rng):
         1.5,
         hidden=((0.1, 0.2, 0.05), (0.4, 0.3, 0.1), (1.6, 0.1, 0.02)),
         hidden_light=((0.2, 0.02, 0.1), (0.8, 0.3, 0.01)),
+        hidden_width=((0.3, 0.1, 0.2), (0.9, 0.2, 0.05)),
     )
     waveform = np.sort(rng.integers(0, 40, 60)).astype(np.int32)
     sigma = rng.uniform(1.2, 3.5, 60)
@@ -95,8 +117,12 @@ def test_the_cover_is_that_of_a_loop(rng):
         height, energy = table.amplitude_err[i], table.relative_energy_err[i]
         assert covered.amplitude_err[i] == pytest.approx(np.hypot(height, light * 40.0), rel=1e-5)
         assert covered.relative_energy_err[i] == pytest.approx(np.hypot(energy, light), rel=1e-5)
+        wide = np.sqrt(excess) * np.interp(excess, [0.3, 0.9], [0.1, 0.2] if alone else [0.2, 0.05])
+        expected = np.hypot(float(table.sigma_err[i]), wide * float(table.sigma[i]))
+        assert covered.sigma_err[i] == pytest.approx(expected, rel=1e-5)
     assert lone and others
-    earlier = cover_hidden(table, replace(system, hidden_light=()), 40)  # a survey of an earlier version
+    old = replace(system, hidden_light=(), hidden_width=())  # a survey of an earlier version
+    earlier = cover_hidden(table, old, 40)
     assert np.array_equal(earlier.time_err, covered.time_err)
-    assert np.array_equal(earlier.amplitude_err, table.amplitude_err)
+    assert all(np.array_equal(getattr(earlier, name), getattr(table, name)) for name in ("amplitude_err", "sigma_err"))
     assert cover_hidden(table, replace(system, hidden=()), 40) is table

@@ -14,6 +14,7 @@ from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 from wavebatch.surveying import Survey
+from wavebatch.surveying.matching.strip_energies import take_energies
 from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing
 from wavebatch.surveying.system_file import SavedSurvey, format_survey
 from wavebatch.surveying.systems.figures import Figures
@@ -99,12 +100,12 @@ def test_without_a_file_of_outgoing_pulses_nothing_changes(tmp_path, sent):
         compare_outgoing(before, strip)
 
 
-def _strip(path, energies):
+def _strip(path, energies, light=None):
     records = [ExtraRecord.build("pulse_energy", "f4", ""), ExtraRecord.build("pulse_energy_err", "f4", "")]
     n, time = len(energies), np.arange(60)
     writer = FullwaveWriter(path, point_format=9, internal=True, digitizers=[Digitizer(1, 8, 60, 1.0)],
                             extra_bytes=records)  # fmt: skip
-    height = 100 * np.nan_to_num(energies, nan=1.0)
+    height = 100 * (np.nan_to_num(energies, nan=1.0) if light is None else light)
     samples = np.round(5 + height[:, None] * np.exp(-0.5 * ((time - 20) / 2.0) ** 2)).astype(np.uint8)
     with writer:
         points = np.zeros(n, writer.dtype)
@@ -161,8 +162,22 @@ def test_the_column_of_an_import_is_used_without_being_asked_for(strip):
 def test_a_column_that_knows_few_pulses_is_not_used_unless_asked_for(tmp_path):
     path = _strip(tmp_path / "s.las", np.r_[np.ones(10), np.full(90, np.nan)])
     assert _filled(path, None) is None
+    with StripReader(path) as reader, reader.scan() as scan:
+        (said,) = take_energies(reader, scan, None).notes
+    assert "fewer than 20 of the sampled pulses have one" in said
     with pytest.raises(OSError, match="--energy pulse_energy knows 10 of 100"):
         _filled(path, "pulse_energy")
+
+
+@pytest.mark.parametrize("known", [0.96, 0.4, 0.05])
+def test_pulses_whose_energy_is_clipped_have_an_error_by_their_light(tmp_path, rng, known):
+    """The strong ones are not known. Beyond a half, or below 200 compared ones, no error held what they are more."""
+    energies = 1 + 0.1 * rng.standard_normal(8000)
+    sent = np.where(energies > np.quantile(energies, known), np.nan, energies)
+    with StripReader(_strip(tmp_path / "s.las", sent, energies)) as reader, reader.scan() as scan:
+        found = take_energies(reader, scan, None)
+    off = np.abs(energies[np.isnan(sent)] / np.nanmean(sent) - 1)
+    assert 0.45 < np.mean(off < found.energy.fills) < 0.95 and "count as of mean energy" in found.notes[0]
 
 
 @pytest.mark.slow

@@ -47,6 +47,7 @@ SYSTEM = SystemPulse(
     misfit=0.1 / 3,
     hidden=((0.035, 1 / 7, 0.0), (0.07, 0.1 + 0.2, 1e-9)),
     hidden_light=((0.035, 2 / 7, 0.0), (0.07, 0.1 + 0.3, 1e-9)),
+    hidden_width=((0.035, 3 / 7, 0.0), (0.07, 0.1 + 0.4, 1e-9)),
 )
 SURVEY = Survey(
     SYSTEM,
@@ -150,11 +151,13 @@ def test_without_saturation_nothing_clips():
 
 def test_files_of_earlier_versions_are_read():
     """They have no correlation, no tail, no misfit and nothing of what is left beside echoes."""
-    text = re.sub(r"^(correlation|whitening|tail_misfit|beside|misfit|hidden(_light)?) = .*\n", "", TEXT, flags=re.M)
-    assert text.count("\n") == TEXT.count("\n") - 7
+    later = "correlation|whitening|tail_misfit|beside|misfit|hidden(_light|_width)?"
+    text = re.sub(rf"^({later}) = .*\n", "", TEXT, flags=re.M)
+    assert text.count("\n") == TEXT.count("\n") - 8
     system = parse_survey(text, "x").survey.system
     noise = replace(SYSTEM.noise, correlation=(), whitening=())
-    assert system == replace(SYSTEM, noise=noise, tail_misfit=(), beside=(), misfit=0.0, hidden=(), hidden_light=())
+    without = replace(SYSTEM, noise=noise, tail_misfit=(), beside=(), misfit=0.0)
+    assert system == replace(without, hidden=(), hidden_light=(), hidden_width=())
 
 
 @pytest.mark.parametrize(

@@ -334,6 +334,13 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             "incidence_angle_normals: this strip does not show well whether its packet vectors are turned against the "
             f"points: the errors hold {sensor.turned:.1g} degrees of it; --trajectory would show it"
         )
+    system = prepared.system
+    lacks = [name for name in ("hidden_light", "hidden_width") if system.hidden and not getattr(system, name)]
+    if lacks:
+        lines.append(
+            f"--system: an earlier version made this file, without {' and '.join(lacks)}: errors of amplitudes, "
+            "energies and widths may be too small where echoes hide others; make it again with `wavebatch survey -o`"
+        )
     # The pulse that a residual loop takes from the survey where the chain names none.
     step = prepared.job.chain.steps[2]
     if step.effective().get("model") == "auto":

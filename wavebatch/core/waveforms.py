@@ -483,6 +483,13 @@ class SystemPulse:
             form="[excess, lone, others]"),
     ] = ()  # fmt: skip
     """What they add to light: excess variance; share of light over the excess's root that 68 % stay within."""
+    hidden_width: Annotated[
+        tuple[tuple[Annotated[float, Range(0.0, 1e4)], _Times, _Times], ...],
+        Key("hidden_width",
+            "(excess variance of a width, share of width over its root of lone and other echoes) by unseen neighbours",
+            form="[excess, lone, others]"),
+    ] = ()  # fmt: skip
+    """What they add to widths, in the same way."""
     other_pulse: bool = False
     """Whether the echoes of a block were fitted with another pulse than the survey's; set while a chain runs."""
     digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)

@@ -29,8 +29,11 @@ NONE = "none"
 SAMPLED_UNITS = 8
 """Units of a strip over whose points the mean is taken."""
 
-LEAST_KNOWN = 0.5
-"""Least share of the sampled points whose energy must be known."""
+LEAST_SHARE = 0.5
+"""Least share of the sampled points whose energy a log that was asked for must know."""
+
+LEAST_KNOWN = 20
+"""Pulses of known energy that show the mean: where they scatter by a tenth, it is known to a fiftieth."""
 
 NEAR = 0.3
 """A pulse has the energy logged at most this share of the usual interval of the log before or after it."""
@@ -142,7 +145,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     scan : StripScan
     request : str or None
         Name of an extra byte of the strip, or path of a text file with columns time and energy. None: the extra byte
-        COLUMN, if the strip has it and it knows half of the pulses; NONE: no energies.
+        COLUMN, if the strip has it and it knows LEAST_KNOWN pulses; NONE: no energies.
 
     Returns
     -------
@@ -192,9 +195,9 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
         new = np.append(True, np.diff(points["gps_time"]) != 0)[: len(points)]
         values = np.append(values, found.read(points[new]))
     there = values[np.isfinite(values)]
-    if len(values) and len(there) < LEAST_KNOWN * len(values):
-        if request is None:
-            return None
+    if request is None and len(there) < min(LEAST_KNOWN, len(values)):
+        return None
+    if request is not None and len(there) < LEAST_SHARE * len(values):
         raise InputError(
             f"{path}: --energy {request} knows {len(there)} of {len(values)} pulses of the strip; it must have "
             "positive energies, a text file those at the GPS times of the points"

@@ -222,7 +222,7 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     Returns
     -------
     SystemPulse
-        With `hidden` and `hidden_light`; unchanged where too few echoes lie close together.
+        With `hidden`, `hidden_light` and `hidden_width`; unchanged where too few echoes lie close together.
 
     Notes
     -----
@@ -236,20 +236,20 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
         return system
     # Too few groups of three: another neighbour is then as likely as a first one.
     both = zip(lone, others if others.any() else lone, strict=True)
-    times, light = (tuple(map(tuple, np.stack([_MIDDLE, *pair], axis=1).tolist())) for pair in both)
-    return replace(system, hidden=times, hidden_light=light)
+    times, light, width = (tuple(map(tuple, np.stack([_MIDDLE, *pair], axis=1).tolist())) for pair in both)
+    return replace(system, hidden=times, hidden_light=light, hidden_width=width)
 
 
 def _measure_class(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, number: np.ndarray, company: bool
 ) -> np.ndarray:
-    """Mean square of the shift over the excess variance, and the share of others' light over its root that BEYOND of
-    all echoes exceed (2, classes).
+    """Mean square of the shift over the excess variance, and the shares of others' light, and of the width that others
+    make, over its root, that BEYOND of all echoes exceed (3, classes).
 
     Of echoes with (company) or without another in their waveform. number: echoes in the waveform of each. An echo that
     hides another was in a waveform with one more.
     """
-    nothing, source = np.zeros((2, len(_MIDDLE))), number > 2 if company else number == 2
+    nothing, source = np.zeros((3, len(_MIDDLE))), number > 2 if company else number == 2
     pick = np.flatnonzero(source & ((echoes.flags & np.uint16(_CUT)) == 0))
     near = 0  # pairs of echoes of one waveform from NEAR to FAR apart
     for step in (1, 2, 3):
@@ -258,7 +258,7 @@ def _measure_class(
         near += int(np.count_nonzero(same & (gap >= NEAR) & (gap < FAR)))
     if len(pick) < FEW or not near:
         return nothing
-    excess, shift, light = _hide_pairs(block, system, echoes.take(pick))
+    excess, shift, *shares = _hide_pairs(block, system, echoes.take(pick))
     expected = near / (FAR - NEAR) * FAR / min(PAIRS, len(block))
     if company:
         # A group with one more, hidden echo looks smaller: its near pair was not counted.
@@ -271,17 +271,17 @@ def _measure_class(
     number = np.maximum(np.maximum(there, hidden), 1.0)
     late = expected * np.histogram(excess, EXCESS, weights=shift**2 / least)[0] / number
     # Of all echoes of a class, those that hide nothing too, as many have more light of others as beyond one deviation.
-    place, share = np.digitize(excess, EXCESS) - 1, np.abs(light) / np.sqrt(least)
-    beyond = np.zeros(len(number))
+    place, shares = np.digitize(excess, EXCESS) - 1, np.abs(shares) / np.sqrt(least)
+    beyond = np.zeros((len(shares), len(number)))
     for kind, most in enumerate(BEYOND * number / expected):
-        ordered = np.sort(share[place == kind])[::-1]
-        beyond[kind] = ordered[int(most)] if most < len(ordered) else 0.0
-    return np.stack([late, beyond])
+        ordered = np.sort(shares[:, place == kind])[:, ::-1]
+        beyond[:, kind] = ordered[:, int(most)] if most < ordered.shape[1] else 0.0
+    return np.stack([late, *beyond])
 
 
 def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[np.ndarray, ...]:
     """Excess variance of pairs that are found as one echo, its distance to the nearer target [widths of the pulse] and
-    the share of its light that is not that target's.
+    the shares of its light and of its width that are not that target's.
     """
     rng = np.random.default_rng(SEED)
     block = block.rows(slice(0, PAIRS))
@@ -297,4 +297,4 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     away = np.abs(time[found.waveform] - found.time[:, None])
     nearer = pairs.take(2 * found.waveform + away.argmin(axis=1))
     light = 1.0 - (nearer.amplitude * nearer.sigma).astype(np.float64) / (found.amplitude * found.sigma)
-    return excess_variance(found, system), away.min(axis=1) / ref, light
+    return excess_variance(found, system), away.min(axis=1) / ref, light, 1.0 - nearer.sigma / found.sigma

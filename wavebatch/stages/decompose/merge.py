@@ -96,7 +96,7 @@ def merge_unresolved(table: EchoTable) -> EchoTable:
 
 
 def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
-    """Enlarge the errors of times, amplitudes and energies by the effect of neighbours that were not found.
+    """Enlarge the errors of times, amplitudes, energies and widths by the effect of neighbours that were not found.
 
     Parameters
     ----------
@@ -114,22 +114,22 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
     Notes
     -----
     An echo that hides another is wider than the pulse. Among echoes of one width the root mean square of their errors
-    is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2). Amplitudes and energies get
-    what 68 % of the echoes of a width stay within: few have a third of their light from another target, and the root
-    mean square would be the error of hardly any. Column 1 of both tables is of lone echoes, column 2 of others.
+    is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2). Amplitudes, energies and
+    widths get what 68 % of the echoes of a width stay within: few have a third of their light from another target, and
+    the root mean square would be the error of hardly any. Column 1 of the tables is of lone echoes, column 2 of others.
     """
     if not system.hidden:
         return table
     wider, alone = np.maximum(excess_variance(table, system), 0.0), table.alone(n)
-    late, share = (
-        np.where(alone, *interpolate(wider, rows[:, 0], rows[:, 1:]).T)
-        for rows in map(np.array, (system.hidden, system.hidden_light or ((0.0, 0.0, 0.0),)))
-    )
+    known = (system.hidden, system.hidden_light, system.hidden_width)
+    tables = (np.array(rows or ((0.0, 0.0, 0.0),)) for rows in known)
+    late, share, width = (np.where(alone, *interpolate(wider, rows[:, 0], rows[:, 1:]).T) for rows in tables)
     light = share * np.sqrt(wider)  # of amplitude and energy alike
     covered = {
         "time_err": np.sqrt(table.time_err**2 + late * wider * system.sigma_ref**2),
         "amplitude_err": np.hypot(table.amplitude_err, light * table.amplitude),
         "relative_energy_err": np.hypot(table.relative_energy_err, light),
+        "sigma_err": np.hypot(table.sigma_err, width * np.sqrt(wider) * table.sigma),
     }
     return replace(table, **{name: error.astype(np.float32) for name, error in covered.items()})
 

@@ -15,12 +15,11 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
-from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
+from wavebatch.files.pulse_energy import COLUMN, LEAST_KNOWN, PulseEnergy, find_column, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import CHANGE_CHANCE, Calibration
 from wavebatch.surveying.matching.setting import (
-    LIKELY,
     QUANTILES,
     SCANNERS,
     compare_scenes,
@@ -43,9 +42,6 @@ pulses one period apart by this share of it at most: surfaces make pulses that l
 
 LEAST_COMPARED = 200
 """Pairs of pulses that show it."""
-
-LEAST_KNOWN = 20
-"""Pulses of known energy that show how bright a digitizer's are: their median scatters by a quarter of each."""
 
 PLACES, OF_PLACE, LEAST_PLACES = 32, 128, 8
 """Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest."""
@@ -127,6 +123,11 @@ def take_energies(
                 f"--energy {energy.source}: its slow changes along the strip are not proved by the strip's brightness: "
                 f"the error of the constant grows by {100 * growth:.1f} %"
             )
+    elif energy is None and request is None and find_column(reader, COLUMN) is not None:
+        notes.append(
+            f"{COLUMN}: fewer than {LEAST_KNOWN} of the sampled pulses have one, so that none counts: what energies "
+            "vary from shot to shot is in amplitudes, and not in their errors"
+        )
     elif energy is not None and energy.known < 1.0:
         chance = CHANGE_CHANCE if calibration is None else calibration.change_chance
         places = _read_places(reader, scan, replace(energy, fills=None))
@@ -245,10 +246,11 @@ def _compare_unknown(pulses: np.ndarray, chance: float) -> tuple[float, float]:
             light[own] -= np.median(known)
     share = alone / max(len(light), 1)
     parts = [light[rows & shown] for rows in (unknown, ~unknown)]
-    if min(map(len, parts)) < LEAST_COMPARED:
+    if min(map(len, parts)) < LEAST_KNOWN:
         return 0.0, share
     change = compare_scenes(*(np.quantile(part, QUANTILES) for part in parts), chance=chance)
-    return math.expm1(max(change.error, abs(change.shift) * (change.chance > LIKELY))), share
+    # All of it: known and unknown pulses are of one scene, and what cannot be measured is no average pulse.
+    return math.expm1(max(change.error, abs(change.shift))), share
 
 
 def _compare_drift(places: list[np.ndarray], shots: float) -> float:

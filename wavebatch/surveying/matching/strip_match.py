@@ -157,21 +157,22 @@ def compare_setting(
     for row in calibration.channels:
         noise, which = system.digitizers.get(row.digitizer, system).noise.std, f"of digitizer {row.digitizer}"
         which += f" scanner channel {row.scanner}" if row.scanner else ""
-        compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
-        # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
-        light = found.brightest.get((row.digitizer, row.scanner))
-        surfaces = "other surfaces"
-        if light and row.brightest and abs(math.log(light / row.brightest * FOOT**2)) < LIKE_FEET:
-            surfaces += ", or coordinates in feet (which make it 10.8 times as bright)"
-        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or {surfaces}: light {which} is")
-        scene = found.scenes.get((row.digitizer, row.scanner))
-        if not scene or len(row.scene) != len(scene):
-            continue
         louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
         ground = _compare_places(calibration, found, row, louder, usual)
+        if ground is None:
+            compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
+            # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
+            light = found.brightest.get((row.digitizer, row.scanner))
+            surfaces = "other surfaces"
+            if light and row.brightest and abs(math.log(light / row.brightest * FOOT**2)) < LIKE_FEET:
+                surfaces += ", or coordinates in feet (which make it 10.8 times as bright)"
+            compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or {surfaces}: light {which} is")
+        scene = found.scenes.get((row.digitizer, row.scanner))
+        if ground is None and (not scene or len(row.scene) != len(scene)):
+            continue
         seen, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
         chance = calibration.change_chance
-        change = change or settings.compare_scenes(scene, row.scene, louder, chance=chance, usual=usual)
+        change = change or settings.compare_scenes(scene or (), row.scene, louder, chance=chance, usual=usual)
         # What common ground shows is in the error, whatever changed it.
         more = math.expm1(max(change.error, abs(change.shift) * bool(ground or change.chance > settings.LIKELY)))
         growth, unseen = max(growth, more), 0.0

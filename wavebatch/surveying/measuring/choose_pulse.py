@@ -275,7 +275,7 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
 def bear(system: SystemPulse, change: float) -> SystemPulse:
     """Return the system with the misfit that a change of the pulse asks for, or what its model misses."""
     misfit = max(COVERED * change, system.misfit)
-    return replace(system, misfit=misfit, tail_misfit=(), beside=(), hidden=(), hidden_light=())
+    return replace(system, misfit=misfit, tail_misfit=(), beside=(), hidden=(), hidden_light=(), hidden_width=())
 
 
 def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, *, known: bool) -> Candidate:
