@@ -13,8 +13,18 @@ def main() -> None:
 
 def _run() -> None:
     import os
+    import sys
 
-    _open_closed_streams()
+    # The null device where stdin, stdout or stderr are closed, as daemons and `2>&-` do. Else the first file that is
+    # opened would get their number, and the messages of a library would go into it.
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
+        if getattr(sys, name) is None:
+            mode = "w" if number else "r"
+            setattr(sys, name, open(number, mode, errors="backslashreplace", closefd=False))  # noqa: SIM115
     from wavebatch.core.process import ONE_THREAD, importing, keep_freed_memory
 
     keep_freed_memory()  # a survey makes and frees 150 MB of arrays
@@ -24,24 +34,6 @@ def _run() -> None:
         from wavebatch.cli import main
 
     main.main()
-
-
-def _open_closed_streams() -> None:
-    """Put the null device where stdin, stdout or stderr are closed, as daemons and `2>&-` do.
-
-    Else the first file that is opened would get their number, and the messages of a library would go into it.
-    """
-    import os
-    import sys
-
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
-        if getattr(sys, name) is None:
-            mode = "w" if number else "r"
-            setattr(sys, name, open(number, mode, errors="backslashreplace", closefd=False))  # noqa: SIM115
 
 
 if __name__ == "__main__":

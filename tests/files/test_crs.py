@@ -9,6 +9,8 @@ import json
 import struct
 import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,8 +33,8 @@ from wavebatch.files.las.crs import (
     build_utm,
     convert_geotiff,
     find_code,
-    looks_geocentric,
     parse_wkt,
+    read_crs,
     read_crs_definition,
     repair_records,
     repair_wkt,
@@ -274,7 +276,9 @@ def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
 def test_geocentric_coordinates_are_told_by_their_size(middle, geocentric):
     middle = np.array(middle, float)
     with np.errstate(over="ignore"):
-        assert bool(looks_geocentric(middle - 2000, middle + 2000)) is geocentric
+        places = {"version": (1, 3), "evlr_count": 0, "compressed": True, "offset_to_points": 0}
+        header = SimpleNamespace(vlrs=(), mins=middle - 2000, maxs=middle + 2000, **places)
+        assert bool(read_crs(Path("s.las"), header)[1]) is geocentric
 
 
 @pytest.mark.parametrize("records", [[], [projection(34735, b"\xff" * 40)]], ids=["no CRS", "a broken one"])

@@ -39,7 +39,6 @@ from wavebatch.tools.bench import accuracy, command
 from wavebatch.tools.sheets.sheet import list_lines
 from wavebatch.tools.simulate import (
     PULSES,
-    PulseModel,
     Recording,
     find_scene,
     simulate_block,
@@ -47,6 +46,7 @@ from wavebatch.tools.simulate import (
     simulate_strip,
 )
 from wavebatch.tools.simulate.render import paint_echoes
+from wavebatch.tools.simulate.scenes import Scene
 
 SMALL = command.BenchOptions(
     scenes=("flat",),
@@ -375,14 +375,14 @@ def test_truth_is_described_as_the_painted_pulse_is(pulse):
     recording = Recording(n_samples=4000, spacing=0.02, pulse=PULSES[pulse])
     for wider in (1.0, 1.5):
         raw = table((0, 30.0, 100, wider * recording.pulse.sigma))
-        told = accuracy.describe_truth(raw, recording.pulse)
+        told = accuracy.make_group(Scene("", "", recording=recording), 0, range(1), raw, None).truth
         y = paint_echoes(recording, 1, np.zeros(1, int), raw.time, raw.amplitude, raw.sigma.astype(float))[0]
         above = np.flatnonzero(y > 0.5 * y.max())
         assert told.time[0] == raw.time[0]
         assert told.sigma[0] * 2.354820 == pytest.approx(0.02 * (above[-1] - above[0] + 1), abs=0.05)
     gaussian = simulate_blocks("urban", 50, seed=1)
     truth = next(gaussian)[1]
-    same = accuracy.describe_truth(truth, PulseModel())
+    same = accuracy.make_group(Scene("", ""), 0, range(50), truth, None).truth
     assert np.array_equal(same.time, truth.time) and np.array_equal(same.sigma, truth.sigma)
 
 

@@ -1,5 +1,6 @@
 """No text of any picture lies on another one or leaves the picture: their boxes are measured."""
 
+import itertools
 from dataclasses import replace
 
 import laspy
@@ -15,6 +16,7 @@ from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
 from wavebatch.tools.plots.waveform import build_views
 
 matplotlib = pytest.importorskip("matplotlib")
+Figure = pytest.importorskip("matplotlib.figure").Figure
 LONG = "a_very_long_name_of_a_strip_as_flight_campaigns_give_them_" * 3 + ".las"
 
 
@@ -24,13 +26,13 @@ def run_plot(*words):
 
 @pytest.fixture
 def texts(monkeypatch):
-    """The texts of every picture that is written: (name of file, text, box [pixels], box of the picture)."""
-    found = []
-    save = figure_file._save
+    """The texts of every picture that is written: (its number, text, box [pixels], box of the picture)."""
+    found, written = [], itertools.count(1)
+    save = Figure.savefig
 
-    def measure(figure, target, overwrite):
-        save(figure, target, overwrite)
-        drawn = []
+    def measure(figure, file, **options):
+        save(figure, file, **options)
+        drawn, name = [], f"picture {next(written)}"
         with monkeypatch.context() as patch:
             draw = matplotlib.text.Text.draw
             record = lambda text, renderer: (drawn.append(text), draw(text, renderer))  # noqa: E731
@@ -38,9 +40,9 @@ def texts(monkeypatch):
             figure.draw_without_rendering()
         for text in dict.fromkeys(drawn):
             if text.get_visible() and text.get_text().strip():
-                found.append((target.name, text.get_text(), text.get_window_extent(), figure.bbox))
+                found.append((name, text.get_text(), text.get_window_extent(), figure.bbox))
 
-    monkeypatch.setattr(figure_file, "_save", measure)
+    monkeypatch.setattr(Figure, "savefig", measure)
     return found
 
 
@@ -116,14 +118,15 @@ def test_slices_and_cubes(texts, tmp_path, riegl):
     assert result.exit_code == 0, result.output
     assert run_plot("cube", tmp_path / "c.npz", "-o", tmp_path / "c.png").exit_code == 0
     check(texts)
-    assert any(riegl.name in text for name, text, *_ in texts if name == "a.png"), "the strip is named"
+    assert any(riegl.name in text for name, text, *_ in texts if name == "picture 1"), "the strip is named"
 
 
 @pytest.mark.slow
 def test_axes_in_metres_have_equal_scales(tmp_path, riegl, monkeypatch):
     kept = []
-    save = figure_file._save
-    monkeypatch.setattr(figure_file, "_save", lambda figure, *rest: (kept.append(figure), save(figure, *rest)))
+    save = Figure.savefig
+    keep = lambda figure, *rest, **options: (kept.append(figure), save(figure, *rest, **options))  # noqa: E731
+    monkeypatch.setattr(Figure, "savefig", keep)
     run_command("slice", riegl, "--lines", "2", "--png", tmp_path / "a.png")
     run_plot("section", riegl, "-o", tmp_path / "s.png")
     run_plot("map", riegl, "--column", "z", "-o", tmp_path / "m.png")

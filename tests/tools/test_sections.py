@@ -17,7 +17,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.scan_slices import ScanLine, Segment, read_scan_lines
-from wavebatch.tools.slice_output import SegmentWriter, align_pulses, build_cube, cut_cube
+from wavebatch.tools.slice_output import CubeBuilder, SegmentWriter, align_pulses, cut_cube
 from wavebatch.tools.voxels.grid import COLUMNS
 
 LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)
@@ -99,10 +99,18 @@ def test_profiles_count_sum_and_average(cloud, voxels):
     assert found.values[0][: len(expected)] == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_cube_has_every_sample_on_one_axis_of_time(riegl):
+def build_cube(path, lines):
+    cube = CubeBuilder(path)
+    for line in lines:
+        cube.add(line)
+    cube.write({}, None, overwrite=False)
+    return np.load(path)
+
+
+def test_the_cube_has_every_sample_on_one_axis_of_time(riegl, tmp_path):
     with StripReader(riegl) as reader, reader.scan() as scan:
         lines = list(read_scan_lines(reader, scan))[:6]
-    cube = build_cube(lines, "c.npz")
+    cube = build_cube(tmp_path / "c.npz", lines)
     values, time, spacing = cube["values"], cube["time"], lines[0].spacing
     columns = align_pulses(lines)
     assert values.shape == (6, 1 + max(map(max, columns)), len(time)) and np.diff(time) == pytest.approx(spacing)
@@ -139,11 +147,11 @@ def _sweep(number, angles):
     return ScanLine(number, row, row * 1e-5, origin, direction, 1.0, row, np.zeros(n), np.asarray(angles, "f4"))
 
 
-def test_lines_of_an_oscillating_mirror_are_aligned_by_scan_angle():
+def test_lines_of_an_oscillating_mirror_are_aligned_by_scan_angle(tmp_path):
     """To and fro, with steps that shrink at the turns; one line begins late, one ends early."""
     swing = 15 * np.sin(np.linspace(-0.45, 0.45, 61) * np.pi)
     lines = [_sweep(0, swing), _sweep(1, swing[::-1]), _sweep(2, swing[20:]), _sweep(3, swing[:35][::-1])]
-    values = build_cube(lines, "c.npz")["values"].max(axis=2)
+    values = build_cube(tmp_path / "c.npz", lines)["values"].max(axis=2)
     for column, angle in enumerate(swing):
         known = values[np.isfinite(values[:, column]), column]
         assert len(known) == 2 + (column >= 20) + (column < 35) and np.abs(known - angle).max() < 1e-4
@@ -164,7 +172,7 @@ def test_slices_of_the_cube(tmp_path):
         with pytest.raises(ConfigError, match=message):
             cut_cube(path, {"x": None, "y": None, "t": None, **wrong})
     with pytest.raises(InputError, match="no scan line"):
-        build_cube([], "c.npz")
+        build_cube(tmp_path / "empty.npz", [])
 
 
 def test_slice_writes_cube_and_overview_once(riegl, tmp_path):

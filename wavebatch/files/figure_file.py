@@ -84,7 +84,11 @@ def open_picture(
         figure = _new_figure(size, dpi)
         set_layout(figure, w_pad=0.1, h_pad=0.08)
         yield figure
-        _save(figure, target, overwrite)
+        suffix = target.suffix.lower()
+        with Draft(target, overwrite=overwrite) as draft:
+            with reporting(target):
+                figure.savefig(draft.file, format=suffix[1:], metadata=_METADATA[suffix])
+            draft.publish()
 
 
 def set_layout(figure: Figure, **options: Any) -> None:
@@ -172,14 +176,6 @@ def _new_figure(size: tuple[float, float], dpi: float) -> Figure:
 
 _UNTOUCHED = ("backend", "backend_fallback", "interactive", "toolbar", "timezone", "webagg.port")
 """Settings of matplotlib that do not change the look of a figure; setting them would touch the user's backend."""
-
-
-def _save(figure: Figure, target: Path, overwrite: bool) -> None:
-    suffix = target.suffix.lower()
-    with Draft(target, overwrite=overwrite) as draft:
-        with reporting(target):
-            figure.savefig(draft.file, format=suffix[1:], metadata=_METADATA[suffix])
-        draft.publish()
 
 
 def plain_text(text: str, most: int = 80) -> str:

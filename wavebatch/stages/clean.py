@@ -85,7 +85,7 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
     if defects.slope_spread > 0:
         # The sloping part of each baseline, 0 in its middle: own slopes, drawn towards none by their errors.
         reach = int(np.ceil(GUARD * system.sigma_ref / block.spacing))
-        recovery = _recovery(system, block.spacing)
+        recovery = int(np.ceil(system.noise.recovery / block.spacing))
         slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing, recovery=recovery)
         spread = system.defects.slope_spread * block.spacing
         slope = np.where(np.isfinite(error), slope * spread**2 / (spread**2 + np.minimum(error, 1e6) ** 2), 0.0)
@@ -150,7 +150,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     reach = int(np.ceil(3 * width))
     # Slopes come from runs of samples much longer than the noise is correlated.
     colour = float(np.sqrt(max(1.0 + 2.0 * sum(system.noise.correlation), 1.0)))
-    recovery = _recovery(system, block.spacing)
+    recovery = int(np.ceil(system.noise.recovery / block.spacing))
     spread, defects = _slope_spread(signal, std, colour, reach, missing, recovery), Defects()
     if spread:
         # Everything else is measured about level baselines.
@@ -180,11 +180,6 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
 RARER = 0.1
 """Share of the steep slopes that must be of the rarer sign: tails, and weak echoes after the last clear one, slope one
 way."""
-
-
-def _recovery(system: SystemPulse, spacing: float) -> int:
-    """Samples after strong signal in which a tail would look like a slope."""
-    return int(np.ceil(system.noise.recovery / spacing))
 
 
 def _slope_spread(

@@ -83,34 +83,31 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
             StripReader(path, direction=direction, headerless=headerless) as reader,
             reader.scan(tolerant=True) as scan,
         ):
-            return _check_strip(path, reader, scan)
+            if scan.broken and not scan.with_waveform:
+                return Findings(str(path), scan.problems[:1], ())
+            facts = reader.facts
+            problems = [*scan.problems, *scan.warnings, *facts.warnings]
+            try:
+                describe_samples(reader, scan)
+            except InputError as error:
+                problems.append(_without_name(path, error))
+            else:
+                problems += () if scan.stranger else doubt_packets(facts, *_match_returns(reader, scan))
+            notes = [
+                f"descriptor {index} has gain 0; counts are used as they are"
+                for index in scan.by_descriptor
+                if index in facts.digitizers and facts.digitizers[index].gain == 0
+            ]
+            if not scan.with_waveform + scan.broken:
+                notes.append("no point has a waveform; every point would be passed through")
+            notes += [*name_gains(facts, scan), *scan.notes, *audit_header(reader, scan)]
+            counts = (scan.points, "point"), (scan.packets, "packet")
+            summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in counts)
+            if scan.packets:
+                summary += f", vectors {scan.vectors.direction} the sensor"
+            return Findings(str(path), tuple(problems), tuple(notes), summary)
     except (OSError, ConfigError, MemoryError) as error:  # the other files are still checked
         return Findings(str(path), (_without_name(path, error),), ())
-
-
-def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
-    if scan.broken and not scan.with_waveform:
-        return Findings(str(path), scan.problems[:1], ())
-    facts = reader.facts
-    problems = [*scan.problems, *scan.warnings, *facts.warnings]
-    try:
-        describe_samples(reader, scan)
-    except InputError as error:
-        problems.append(_without_name(path, error))
-    else:
-        problems += () if scan.stranger else doubt_packets(facts, *_match_returns(reader, scan))
-    notes = [
-        f"descriptor {index} has gain 0; counts are used as they are"
-        for index in scan.by_descriptor
-        if index in facts.digitizers and facts.digitizers[index].gain == 0
-    ]
-    if not scan.with_waveform + scan.broken:
-        notes.append("no point has a waveform; every point would be passed through")
-    notes += [*name_gains(facts, scan), *scan.notes, *audit_header(reader, scan)]
-    summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in ((scan.points, "point"), (scan.packets, "packet")))
-    if scan.packets:
-        summary += f", vectors {scan.vectors.direction} the sensor"
-    return Findings(str(path), tuple(problems), tuple(notes), summary)
 
 
 def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:

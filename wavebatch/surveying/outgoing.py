@@ -88,31 +88,26 @@ def learn_shape(samples: np.ndarray, spacing: float, reference: OutgoingReferenc
         if len(stack.lag) < 12:
             return None
         fits = fit_gaussians(stack, reference.width, GAUSSIANS, GOAL * float(np.sqrt(np.mean(stack.error**2))))
-        time, height = _align(signal, time + fits[-1].datum, height, fits[-1].components)
+        # One Gauss-Newton step of times and heights with the sum of Gaussians.
+        time = time + fits[-1].datum
+        lag = np.arange(signal.shape[1]) - time[:, None]
+        pulse, slope = np.zeros_like(lag), np.zeros_like(lag)
+        for weight, delay, sigma in fits[-1].components:
+            away = (lag - delay) / sigma
+            bell = weight * exp(-0.5 * away**2)
+            pulse += bell
+            slope += bell * away / sigma
+        slope *= height[:, None]
+        rest = signal - height[:, None] * pulse
+        a, b, c = (pulse**2).sum(axis=1), (pulse * slope).sum(axis=1), (slope**2).sum(axis=1)
+        p, q = (rest * pulse).sum(axis=1), (rest * slope).sum(axis=1)
+        scale = np.maximum(a * c - b * b, 1e-12)
+        step = np.clip((a * q - b * p) / scale, -0.5, 0.5)
+        time, height = time + step, height + (c * p - b * q) / scale
         if not (np.isfinite(time).all() and (height > 0).all()):
             return None
     shape = _describe(stack, fits[-1], spacing, len(good))
     return shape if shape.fwhm > 0 else None
-
-
-def _align(
-    signal: np.ndarray, time: np.ndarray, height: np.ndarray, components: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Times and heights of pulses (n, s) by one Gauss-Newton step with a sum of Gaussians."""
-    lag = np.arange(signal.shape[1]) - time[:, None]
-    pulse, slope = np.zeros_like(lag), np.zeros_like(lag)
-    for weight, delay, sigma in components:
-        away = (lag - delay) / sigma
-        bell = weight * exp(-0.5 * away**2)
-        pulse += bell
-        slope += bell * away / sigma
-    slope *= height[:, None]
-    rest = signal - height[:, None] * pulse
-    a, b, c = (pulse**2).sum(axis=1), (pulse * slope).sum(axis=1), (slope**2).sum(axis=1)
-    p, q = (rest * pulse).sum(axis=1), (rest * slope).sum(axis=1)
-    scale = np.maximum(a * c - b * b, 1e-12)
-    step = np.clip((a * q - b * p) / scale, -0.5, 0.5)
-    return time + step, height + (c * p - b * q) / scale
 
 
 def _describe(stack: Stack, fit: PulseFit, spacing: float, pulses: int) -> OutgoingShape:

@@ -56,53 +56,47 @@ class CubeBuilder:
     def write(self, meta: dict[str, Any], crs: str | None, *, overwrite: bool) -> tuple[int, int, int]:
         """Writes the cube; returns its shape: lines, pulses, times.
 
-        Raises InputError without a line, and where lines differ in their spacing.
+        values f4 (lines, pulses, times): samples above the level without signal [DN], NaN where nothing was recorded.
+        time f8 (times,): two-way [ns], from the plane across the mean ray through the sample nearest to the sensor.
+        offset f4 (lines, pulses): to add to the times of a pulse [ns], within half a sample: samples are moved, not
+        interpolated. line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no pulse at
+        that scan angle. Raises InputError without a line, and where lines differ in their spacing.
         """
-        arrays: dict[str, Any] = build_cube(self._lines, str(self._target))
+        lines, name = self._lines, str(self._target)
+        if not lines:
+            raise InputError(f"{name}: not written, because there is no scan line")
+        spacing = lines[0].spacing
+        if any(abs(line.spacing - spacing) > 1e-6 * spacing for line in lines):
+            raise InputError(f"{name}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
+        # Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known.
+        origin, direction = (np.concatenate([getattr(line, key) for line in lines]) for key in ("origin", "direction"))
+        starts = np.split(align_times(origin, direction), np.cumsum([len(line) for line in lines])[:-1])
+        shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
+        columns = align_pulses(lines)
+        pulses = 1 + max(int(column.max()) for column in columns)
+        times = 1 + max(int((shift[i][line.row] + np.rint(line.time / spacing)).max()) for i, line in enumerate(lines))
+        if len(lines) * pulses * times > MOST_VALUES:
+            raise ConfigError(
+                f"{name}: {len(lines)} lines of up to {pulses} pulses over {times} samples are too many: choose fewer"
+            )
+        shape = (len(lines), pulses)
+        values = np.full((*shape, times), np.nan, np.float32)
+        place = {"gps_time": np.full(shape, np.nan), "offset": np.full(shape, np.nan, np.float32)}
+        place |= {name: np.full((*shape, 3), np.nan) for name in ("origin", "direction")}
+        for i, line in enumerate(lines):
+            sample = shift[i][line.row] + np.rint(line.time / spacing).astype(np.int64)
+            values[i, columns[i][line.row], sample] = line.value
+            for key in ("gps_time", "origin", "direction"):
+                place[key][i, columns[i]] = getattr(line, key)
+            place["offset"][i, columns[i]] = starts[i] - shift[i] * spacing
+        number = np.array([line.number for line in lines])
+        arrays: dict[str, Any] = {"values": values, "time": np.arange(times) * spacing, "line": number, **place}
         arrays |= {"crs": np.array(crs or ""), "meta": np.array(json.dumps(meta, sort_keys=True))}
         with Draft(self._target, overwrite=overwrite) as draft:
             with reporting(self._target):
                 np.savez_compressed(draft.file, **arrays)
             draft.publish()
         return arrays["values"].shape
-
-
-def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
-    """Arrays of the cube of some lines; name: of the file, for messages.
-
-    values f4 (lines, pulses, times): samples above the level without signal [DN], NaN where nothing was recorded.
-    time f8 (times,): two-way [ns], from the plane across the mean ray through the sample nearest to the sensor. offset
-    f4 (lines, pulses): to add to the times of a pulse [ns], within half a sample: samples are moved, not interpolated.
-    line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no pulse at that scan angle.
-    """
-    if not lines:
-        raise InputError(f"{name}: not written, because there is no scan line")
-    spacing = lines[0].spacing
-    if any(abs(line.spacing - spacing) > 1e-6 * spacing for line in lines):
-        raise InputError(f"{name}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
-    # Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known.
-    origin, direction = (np.concatenate([getattr(line, name) for line in lines]) for name in ("origin", "direction"))
-    starts = np.split(align_times(origin, direction), np.cumsum([len(line) for line in lines])[:-1])
-    shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
-    columns = align_pulses(lines)
-    pulses = 1 + max(int(column.max()) for column in columns)
-    times = 1 + max(int((shift[i][line.row] + np.rint(line.time / spacing)).max()) for i, line in enumerate(lines))
-    if len(lines) * pulses * times > MOST_VALUES:
-        raise ConfigError(
-            f"{name}: {len(lines)} lines of up to {pulses} pulses over {times} samples are too many: choose fewer"
-        )
-    shape = (len(lines), pulses)
-    values = np.full((*shape, times), np.nan, np.float32)
-    place = {"gps_time": np.full(shape, np.nan), "offset": np.full(shape, np.nan, np.float32)}
-    place |= {name: np.full((*shape, 3), np.nan) for name in ("origin", "direction")}
-    for i, line in enumerate(lines):
-        sample = shift[i][line.row] + np.rint(line.time / spacing).astype(np.int64)
-        values[i, columns[i][line.row], sample] = line.value
-        for key in ("gps_time", "origin", "direction"):
-            place[key][i, columns[i]] = getattr(line, key)
-        place["offset"][i, columns[i]] = starts[i] - shift[i] * spacing
-    number = np.array([line.number for line in lines])
-    return {"values": values, "time": np.arange(times) * spacing, "line": number, **place}
 
 
 def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:

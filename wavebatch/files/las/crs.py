@@ -455,16 +455,6 @@ def find_epsg(wkt: str) -> int | None:
     return int(found[1]) or None if found else None
 
 
-def looks_geocentric(mins: Sequence[float], maxs: Sequence[float]) -> bool:
-    """Whether the extent of a strip lies on the surface of the Earth as seen from its centre.
-
-    Projected coordinates may be as far from their origin, but none has heights of tens of kilometres.
-    """
-    middle = [0.5 * (low + high) for low, high in zip(mins, maxs, strict=True)]
-    distance = math.hypot(*middle)
-    return _EARTH[0] < distance < _EARTH[1] and abs(middle[2]) > _HIGHEST
-
-
 def _name_unit(metres: float | None) -> str:
     if metres is None:
         return "metres"
@@ -495,7 +485,12 @@ def read_crs(path: Path, header: las.LasHeader) -> tuple[str | None, tuple[CrsUn
         keys = GeoKeys.parse(records[las.GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b""))
         text = text or keys.name or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
         units.append(CrsUnits(keys.kind, *keys.read_units()))
-    if all(unit == CrsUnits() for unit in units) and looks_geocentric(header.mins, header.maxs):
+    middle = [0.5 * (low + high) for low, high in zip(header.mins, header.maxs, strict=True)]
+    distance = math.hypot(*middle)
+    # On the surface of the Earth as seen from its centre: projected coordinates may be as far from their origin, but
+    # none has heights of tens of kilometres.
+    geocentric = _EARTH[0] < distance < _EARTH[1] and abs(middle[2]) > _HIGHEST
+    if geocentric and all(unit == CrsUnits() for unit in units):
         units.append(CrsUnits("geocentric"))
     return text, tuple(units)
 

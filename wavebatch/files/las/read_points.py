@@ -158,32 +158,6 @@ class _Coding(NamedTuple):
     """Layers of a chunk; 0 in point formats 0 to 5."""
 
 
-def _read_coding(path: Path, header: las.LasHeader) -> _Coding:
-    payload = next((vlr.payload for vlr in header.vlrs if las.has_record([vlr], LASZIP_USER, LASZIP_ID)), b"")
-    broken = damaged(path, 'its "laszip encoded" record is missing or wrong')
-    if len(payload) < _LASZIP.size:
-        raise broken
-    compressor, coder, *_, chunk_points, _, _, n_items = _LASZIP.unpack_from(payload)
-    if len(payload) < _LASZIP.size + n_items * _ITEM.size or not n_items:
-        raise broken
-    payload = payload[: _LASZIP.size + n_items * _ITEM.size]
-    items = list(_ITEM.iter_unpack(payload[_LASZIP.size :]))
-    kinds = tuple(kind for kind, _, _ in items if kind not in _BYTES)
-    good = all(size == _ITEM_SIZES[kind] if kind in _ITEM_SIZES else kind in _BYTES for kind, size, _ in items)
-    length = sum(size for _, size, _ in items)
-    if not good or kinds != _FORMAT_ITEMS[header.point_format] or length != header.point_length or coder != 0:
-        raise broken
-    if [kind for kind, _, _ in items if kind in _BYTES] not in ([], [14 if header.point_format > 5 else 0]):
-        raise broken
-    remedy = "run laszip -i IN.laz -o OUT.las first"
-    if compressor != (3 if header.point_format > 5 else 2) or not 0 < chunk_points <= _VARIABLE:
-        raise InputError(f"{path}: compressed without chunks; {remedy}")
-    if MAX_CHUNK_POINTS < chunk_points < _VARIABLE:
-        raise InputError(f"{path}: LAZ chunks of {chunk_points} points do not fit into memory; {remedy}")
-    layers = (size if kind in _BYTES else _LAYERS[kind] for kind, size, _ in items) if kinds[0] == 10 else ()
-    return _Coding(payload, chunk_points, max(version for _, _, version in items), sum(layers))
-
-
 class LazPoints:
     """Reads with lazrs, one chunk in memory at a time; points of a chunk before the wanted ones are decoded too."""
 
@@ -298,10 +272,33 @@ def open_points(checked: CheckedHeader) -> PointSource:
 
     Raises InputError if the records of the compression are damaged, or are those of LAS 1.5.
     """
-    with reading(checked.path):
-        if not checked.header.compressed:
+    path, header = checked.path, checked.header
+    with reading(path):
+        if not header.compressed:
             return _PlainPoints(checked)
-        coding = _read_coding(checked.path, checked.header)
+        payload = next((vlr.payload for vlr in header.vlrs if las.has_record([vlr], LASZIP_USER, LASZIP_ID)), b"")
+        broken = damaged(path, 'its "laszip encoded" record is missing or wrong')
+        if len(payload) < _LASZIP.size:
+            raise broken
+        compressor, coder, *_, chunk_points, _, _, n_items = _LASZIP.unpack_from(payload)
+        if len(payload) < _LASZIP.size + n_items * _ITEM.size or not n_items:
+            raise broken
+        payload = payload[: _LASZIP.size + n_items * _ITEM.size]
+        items = list(_ITEM.iter_unpack(payload[_LASZIP.size :]))
+        kinds = tuple(kind for kind, _, _ in items if kind not in _BYTES)
+        good = all(size == _ITEM_SIZES[kind] if kind in _ITEM_SIZES else kind in _BYTES for kind, size, _ in items)
+        length = sum(size for _, size, _ in items)
+        if not good or kinds != _FORMAT_ITEMS[header.point_format] or length != header.point_length or coder != 0:
+            raise broken
+        if [kind for kind, _, _ in items if kind in _BYTES] not in ([], [14 if header.point_format > 5 else 0]):
+            raise broken
+        remedy = "run laszip -i IN.laz -o OUT.las first"
+        if compressor != (3 if header.point_format > 5 else 2) or not 0 < chunk_points <= _VARIABLE:
+            raise InputError(f"{path}: compressed without chunks; {remedy}")
+        if MAX_CHUNK_POINTS < chunk_points < _VARIABLE:
+            raise InputError(f"{path}: LAZ chunks of {chunk_points} points do not fit into memory; {remedy}")
+        layers = (size if kind in _BYTES else _LAYERS[kind] for kind, size, _ in items) if kinds[0] == 10 else ()
+        coding = _Coding(payload, chunk_points, max(version for _, _, version in items), sum(layers))
         total = checked.header.point_count
         if total > checked.size * MAX_POINTS_PER_BYTE:  # a scan of points that cannot be there would never end
             raise damaged(checked.path, f"the header claims {total} points in {checked.size} bytes")

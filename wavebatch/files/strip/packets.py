@@ -65,7 +65,28 @@ def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:
     """
     checked = read_checked_header(path)
     header = checked.header
-    digitizers, compression, odd = read_descriptors(header)
+    # All descriptors among the VLRs count, also unused and empty ones; `packet_check` checks those that are used.
+    digitizers: dict[int, Digitizer] = {}
+    compression: dict[int, int] = {}
+    odd = []
+    for vlr in header.vlrs:
+        if vlr.user != "LASF_Spec" or not _FIRST_ID <= vlr.record_id <= _LAST_ID:
+            continue
+        index = vlr.record_id - _FIRST_ID + 1
+        if len(vlr.payload) < DESCRIPTOR.size:
+            odd.append(f"descriptor {index} has {len(vlr.payload)} bytes instead of 26 and is ignored")
+            continue
+        bits, kind, samples, spacing, gain, offset = DESCRIPTOR.unpack_from(vlr.payload)
+        for name, value in ("gain", gain), ("offset", offset):
+            if not abs(value) <= MOST_VOLTS:
+                reason = "which no digitizer has; it counts as not given, and counts are used as they are"
+                odd.append(f"descriptor {index} has {name} {value:g} V, {reason}")
+        gain, offset = (value if abs(value) <= MOST_VOLTS else 0.0 for value in (gain, offset))
+        digitizer = Digitizer(index, bits, samples, spacing / PS_PER_NS, gain, offset)
+        if index not in digitizers:
+            digitizers[index], compression[index] = digitizer, kind
+        elif digitizers[index] != digitizer:
+            odd.append(f"descriptor {index} is there twice with different content; the first one is used")
     place = locate_packets(checked, compression, headerless)
     if place.base < 0:
         with contextlib.closing(open_points(checked)) as points:
@@ -119,35 +140,6 @@ class PacketPlace:
     def shift(self) -> int:
         """What a copy of the packets adds to byte offsets that count from the first byte of a .wdp without header."""
         return max(0, las.EVLR_HEADER_SIZE - self.offsets[0])
-
-
-def read_descriptors(header: las.LasHeader) -> tuple[dict[int, Digitizer], dict[int, int], list[str]]:
-    """Return digitizers and compression types by index, and warnings.
-
-    All descriptors among the VLRs count, also unused and empty ones; `packet_check` checks those that are used.
-    """
-    digitizers: dict[int, Digitizer] = {}
-    compression: dict[int, int] = {}
-    warnings = []
-    for vlr in header.vlrs:
-        if vlr.user != "LASF_Spec" or not _FIRST_ID <= vlr.record_id <= _LAST_ID:
-            continue
-        index = vlr.record_id - _FIRST_ID + 1
-        if len(vlr.payload) < DESCRIPTOR.size:
-            warnings.append(f"descriptor {index} has {len(vlr.payload)} bytes instead of 26 and is ignored")
-            continue
-        bits, kind, samples, spacing, gain, offset = DESCRIPTOR.unpack_from(vlr.payload)
-        for name, value in ("gain", gain), ("offset", offset):
-            if not abs(value) <= MOST_VOLTS:
-                reason = "which no digitizer has; it counts as not given, and counts are used as they are"
-                warnings.append(f"descriptor {index} has {name} {value:g} V, {reason}")
-        gain, offset = (value if abs(value) <= MOST_VOLTS else 0.0 for value in (gain, offset))
-        digitizer = Digitizer(index, bits, samples, spacing / PS_PER_NS, gain, offset)
-        if index not in digitizers:
-            digitizers[index], compression[index] = digitizer, kind
-        elif digitizers[index] != digitizer:
-            warnings.append(f"descriptor {index} is there twice with different content; the first one is used")
-    return digitizers, compression, warnings
 
 
 def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerless: bool) -> PacketPlace:

@@ -85,24 +85,20 @@ def find_fill(samples: np.ndarray, *tops: int) -> np.ndarray | None:
     for value in {0, *tops}:
         if least > 0 if value == 0 else largest < value:
             continue
-        rows = _rows_with_runs(samples, value)
+        # Rows that may hold a long run of the count: all that do, and few others. Every long run holds every eighth
+        # sample of the block at least once, and the four before or after it.
+        flat = samples.reshape(-1)
+        first, half = LEAST_PADDING - 1, LEAST_PADDING // 2
+        seen = flat[first::LEAST_PADDING]
+        at = np.flatnonzero(seen == value) * LEAST_PADDING + first
+        after = np.minimum(at + half, len(flat) - 1)
+        at = at[(flat[at - half] == value) | (flat[after] == value)]
+        rows = distinct(at // s)
         found = _find_fill_rows(samples[rows], value) if len(rows) else None
         if found is not None and found.any():
             fill = np.zeros(samples.shape, bool) if fill is None else fill
             fill[rows] |= found
     return fill
-
-
-def _rows_with_runs(samples: np.ndarray, value: int) -> np.ndarray:
-    """Rows of samples (n, s) that may hold a long run of one count: all that do, and few others."""
-    flat, s = samples.reshape(-1), samples.shape[1]
-    # Every long run holds every eighth sample of the block at least once, and the four before or after it.
-    first, half = LEAST_PADDING - 1, LEAST_PADDING // 2
-    seen = flat[first::LEAST_PADDING]
-    at = np.flatnonzero(seen == value) * LEAST_PADDING + first
-    after = np.minimum(at + half, len(flat) - 1)
-    at = at[(flat[at - half] == value) | (flat[after] == value)]
-    return distinct(at // s)
 
 
 def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:

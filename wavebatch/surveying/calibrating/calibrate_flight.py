@@ -263,13 +263,10 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
         )
     if odd:
         return adjusted, (most, *map(float, adjusted.terms)), None
+    # The error of the constants if they differ because each strip was seen from another side, or if the light falls
+    # from side to side and not to both edges, where that explains the overlaps nearly as well.
     other = adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
-    return adjusted, (most, *map(float, adjusted.terms), 0.0), _leave_open(ties, adjusted, other, columns[:, 2])
-
-
-def _leave_open(ties: Ties, adjusted: Adjustment, other: Adjustment, side: np.ndarray) -> float:
-    """Error of the constants if they differ because each strip was seen from another side, or if the light falls from
-    side to side and not to both edges, where that explains the overlaps nearly as well."""
+    side = columns[:, 2]
     n, grid = len(adjusted.value), np.linspace(-1.0, 1.0, 21)
     place = np.bincount(ties.source, side, n) / np.maximum(adjusted.ties, 1)
     known = np.isfinite(adjusted.value) & (adjusted.ties > 0)
@@ -278,7 +275,8 @@ def _leave_open(ties: Ties, adjusted: Adjustment, other: Adjustment, side: np.nd
     apart = float(np.mean(adjusted.value[known] - other.value[known]))
     apart = apart + swath_columns(grid, 1.0) @ [*adjusted.terms, -other.terms[0]]
     alike = other.scatter < max(LEAST_SPREAD, adjusted.scatter / EXPLAINED)
-    return max(drift, float(np.sqrt(np.mean(apart**2))) if alike else 0.0)
+    error = max(drift, float(np.sqrt(np.mean(apart**2))) if alike else 0.0)
+    return adjusted, (most, *map(float, adjusted.terms), 0.0), error
 
 
 def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustment) -> Trend | None:

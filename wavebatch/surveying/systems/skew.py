@@ -64,8 +64,19 @@ def measure_skew(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
         return system
     # Not every second or third: channels take turns.
     chosen = echoes.take(rows[np.unique(np.linspace(0, len(rows) - 1, MOST_FITTED).astype(np.int64))])
-    skew, error = fit_single(block, system, chosen)
-    known = np.isfinite(skew) & np.isfinite(error) & (error > 0)
+    # A skewed pulse is fitted to each of them alone.
+    spacing, s = block.spacing, block.samples.shape[1]
+    part = block.rows(chosen.waveform)
+    time, width = chosen.time / spacing, chosen.sigma.astype(np.float64) / spacing
+    reach, row = np.maximum(LOBE * width, 2.5), np.arange(len(chosen))
+    low = np.clip(np.ceil(time - reach), 0, s - 1).astype(np.int64)
+    high = np.clip(np.floor(time + reach) + 1, low + 1, s).astype(np.int64)
+    settings = Settings(1.0, 0.05, float(s), tolerance=0.1, grow=False, skew_spread=WEAK_PRIOR)
+    starts = Candidates(row, time, chosen.amplitude.astype(np.float64), width)
+    clusters = Clusters(row, low, high, row, np.ones_like(row))
+    fit = decompose_clusters(samples_of(part, pooled(part, system)), starts, clusters, settings)
+    skew, error = fit.parameters[:, 3], fit.errors[:, 3]
+    known = fit.converged & ~fit.at_bound & np.isfinite(skew) & np.isfinite(error) & (error > 0)
     narrow = known & (chosen.sigma < NARROW * find_edge(chosen.sigma))
     if np.count_nonzero(narrow) < FEW:
         return system
@@ -73,34 +84,3 @@ def measure_skew(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     scatter = float(np.quantile(np.abs(skew[known] - typical), MOST)) / NORMAL_MOST
     excess = scatter**2 - float(np.median(error[known] ** 2))
     return replace(system, skew=typical, skew_spread=max(float(np.sqrt(max(excess, 0.0))), LEAST_SPREAD))
-
-
-def fit_single(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a skewed pulse to every echo alone.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-        The waveforms.
-    system : SystemPulse
-        With the noise.
-    echoes : EchoTable
-        m echoes that are alone in their waveforms.
-
-    Returns
-    -------
-    skew, error : float64 array, shape (m,)
-        Skew of each echo and its standard deviation.
-    """
-    spacing, s = block.spacing, block.samples.shape[1]
-    part = block.rows(echoes.waveform)
-    time, width = echoes.time / spacing, echoes.sigma.astype(np.float64) / spacing
-    reach, row = np.maximum(LOBE * width, 2.5), np.arange(len(echoes))
-    low = np.clip(np.ceil(time - reach), 0, s - 1).astype(np.int64)
-    high = np.clip(np.floor(time + reach) + 1, low + 1, s).astype(np.int64)
-    settings = Settings(1.0, 0.05, float(s), tolerance=0.1, grow=False, skew_spread=WEAK_PRIOR)
-    starts = Candidates(row, time, echoes.amplitude.astype(np.float64), width)
-    clusters = Clusters(row, low, high, row, np.ones_like(row))
-    fit = decompose_clusters(samples_of(part, pooled(part, system)), starts, clusters, settings)
-    known = fit.converged & ~fit.at_bound
-    return np.where(known, fit.parameters[:, 3], np.nan), np.where(known, fit.errors[:, 3], np.nan)

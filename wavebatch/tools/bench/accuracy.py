@@ -139,15 +139,6 @@ _STEP = 0.02
 """Step of the numeric derivatives, in widths of the system pulse."""
 
 
-def describe_truth(truth: EchoTable, pulse: PulseModel) -> EchoTable:
-    """The truth with, as sigma, the full width at half maximum over 2.354820.
-
-    Simulation gives the sigma of the main lobe; decomposers report that of the whole pulse. For a Gaussian they are
-    equal.
-    """
-    return replace(truth, sigma=_measure(pulse, truth.sigma.astype(np.float64)).astype(np.float32))
-
-
 def smoothed_power(color: np.ndarray | int) -> np.ndarray | float:
     """Variance of noise smoothed by [1 2 1], over that of its samples; color: as Recording.color."""
     first, second = color / (color + 1), color * (color - 1) / ((color + 1) * (color + 2))
@@ -287,12 +278,17 @@ def make_groups(
 def make_group(
     scene: Scene, number: int, block: WaveformBlock, truth: EchoTable, survey: Survey, *, clear: float = CLEAR
 ) -> Group:
-    """The group of a simulated block and its survey; clear: signal to noise from which echoes are compared."""
+    """The group of a simulated block and its survey; clear: signal to noise from which echoes are compared.
+
+    Simulation gives the sigma of the main lobe; decomposers report that of the whole pulse. So the truth of the group
+    has, as sigma, the full width at half maximum over 2.354820. For a Gaussian they are equal.
+    """
     recording = scene.recording
+    sigma = _measure(recording.pulse, truth.sigma.astype(np.float64))
     return Group(
         number=number,
         block=block,
-        truth=describe_truth(truth, recording.pulse),
+        truth=replace(truth, sigma=sigma.astype(np.float32)),
         isolated=find_isolated_echoes(truth),
         bounds=find_bounds(recording, truth, len(block)),
         survey=survey,

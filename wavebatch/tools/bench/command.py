@@ -301,7 +301,32 @@ def shape_scene(strip: Path, chain: Chain) -> StripScene:
         )
     block = pool_blocks(chosen)
     system = survey_blocks([block]).system
-    recording = describe_recording(system, block)
+    # The receiver that the survey found: levels, noise and its colour, clipping, learned pulse.
+    stds = system.noise.by_kind
+    pairs = [(stds.get(f"{kind}_smoothed", 0.0), stds.get(kind, 0.0)) for kind in ("tail", "quiet")]
+    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
+    # The binomial filter whose noise changes by smoothing as the noise of the strip does.
+    color = int(np.argmin(np.abs(np.sqrt(accuracy.smoothed_power(np.arange(5)) / 6) - ratio)))
+    # Noise of one sample; `noise.std` is what coloured noise does to the amplitude of a pulse.
+    noise = stds.get("outside") or stds.get("quiet") or system.noise.std
+    gain = np.sqrt(accuracy.smoothed_power(color) / 6)
+    pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
+    if len(system.components) > 1:
+        weight, delay, sigma = system.components[0]
+        pulse = PulseModel(sigma, 0.0, tuple((w / weight, d - delay, s) for w, d, s in system.components[1:]))
+    clip = None if system.saturation is None else int(min(system.saturation, block.digitizer.max_count))
+    recording = Recording(
+        n_samples=block.samples.shape[1],
+        spacing=block.spacing,
+        bits=block.digitizer.bits,
+        baseline=system.noise.baseline,
+        baseline_spread=system.noise.baseline_spread,
+        noise_std=float(np.sqrt(max(noise**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
+        rho=color / (color + 1),
+        noise_gain=system.noise.gain,
+        saturation=clip,
+        pulse=pulse,
+    )
     found = chain.run(block, system)
     bad = int(EchoFlag.NOT_CONVERGED | EchoFlag.NEAR_EDGE | EchoFlag.AMPLITUDE_UNRELIABLE)
     keep = ((found.flags & bad) == 0) & (found.time > 0) & (found.time < recording.duration)
@@ -324,35 +349,6 @@ def shape_scene(strip: Path, chain: Chain) -> StripScene:
         sigma=np.clip(sigma * (lobe / system.sigma_ref), 0.85 * lobe, 4.0 * lobe),
     )
     return StripScene(strip.name, f"like {strip.name}", recording=recording, sample=sample)
-
-
-def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
-    """The receiver that a survey found: levels, noise and its colour, clipping, learned pulse."""
-    kinds = system.noise.by_kind
-    pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
-    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
-    # The binomial filter whose noise changes by smoothing as the noise of the strip does.
-    color = int(np.argmin(np.abs(np.sqrt(accuracy.smoothed_power(np.arange(5)) / 6) - ratio)))
-    # Noise of one sample; `noise.std` is what coloured noise does to the amplitude of a pulse.
-    noise = kinds.get("outside") or kinds.get("quiet") or system.noise.std
-    gain = np.sqrt(accuracy.smoothed_power(color) / 6)
-    pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
-    if len(system.components) > 1:
-        weight, delay, sigma = system.components[0]
-        pulse = PulseModel(sigma, 0.0, tuple((w / weight, d - delay, s) for w, d, s in system.components[1:]))
-    clip = None if system.saturation is None else int(min(system.saturation, block.digitizer.max_count))
-    return Recording(
-        n_samples=block.samples.shape[1],
-        spacing=block.spacing,
-        bits=block.digitizer.bits,
-        baseline=system.noise.baseline,
-        baseline_spread=system.noise.baseline_spread,
-        noise_std=float(np.sqrt(max(noise**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
-        rho=color / (color + 1),
-        noise_gain=system.noise.gain,
-        saturation=clip,
-        pulse=pulse,
-    )
 
 
 # Run time and memory

@@ -415,18 +415,13 @@ class DetectorSignal(Searched):
     """The echoes that the detector found in the one waveform."""
 
 
-def list_signals() -> dict[str, str]:
-    """Kinds of signal that --show names, and the detector of each: the first by its name."""
-    found: dict[str, str] = {}
-    for name, one in sorted(STAGES.items()):
-        if one.searches and one.searches[0]:
-            found.setdefault(one.searches[0], name)
-    return found
-
-
 def choose_step(chain: Chain, show: str) -> Step:
     """The detector whose signal is shown: that of the chain if it searches in this kind, else the kind's first one."""
-    step, kinds = chain.steps[1], list_signals()
+    step = chain.steps[1]
+    kinds: dict[str, str] = {}  # of signal that --show names, and the first detector of each by its name
+    for name, one in sorted(STAGES.items()):
+        if one.searches and one.searches[0]:
+            kinds.setdefault(one.searches[0], name)
     if show == "detector":
         if step.stage.searches is None:
             raise ConfigError(f"--show detector: {step.stage.name} has no known signal; choose {', '.join(kinds)}")

@@ -330,23 +330,6 @@ HAZARDS: dict[str, Draw] = {
 """Every hazard by name; scene `stiff` mixes them evenly, scene `stiff.<name>` holds one of them."""
 
 
-def draw_hazards(rng: np.random.Generator, n: int, recording: Recording, names: tuple[str, ...]) -> Drawn:
-    """Each waveform one of the named hazards, evenly at random."""
-    kind = rng.integers(0, len(names), n)
-    parts = []
-    constant = np.full(n, np.nan)
-    for number, name in enumerate(names):
-        rows = np.flatnonzero(kind == number)
-        part = HAZARDS[name](rng, len(rows), recording)
-        if part.constant is not None:
-            constant[rows] = part.constant
-        ghost = np.zeros(len(part.time), bool) if part.ghost is None else part.ghost
-        parts.append((rows[part.waveform], part.time, part.amplitude, part.sigma, ghost))
-    waveform, time, amplitude, sigma, ghost = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    order = np.lexsort((time, waveform))
-    return Drawn(waveform[order], time[order], amplitude[order], sigma[order], ghost[order], constant)
-
-
 GROUND_REFLECTS, ROOFS_REFLECT = 0.2, 0.4
 """Diffuse reflectances in scenes with light."""
 
@@ -388,7 +371,20 @@ class Scene:
     def draw(self, rng: np.random.Generator, n: int, rays: SceneRays) -> Drawn:
         """Echoes of n waveforms along n rays."""
         if self.hazards:
-            return draw_hazards(rng, n, self.recording, self.hazards)
+            # Each waveform has one of them, evenly at random.
+            kind = rng.integers(0, len(self.hazards), n)
+            parts = []
+            constant = np.full(n, np.nan)
+            for number, name in enumerate(self.hazards):
+                rows = np.flatnonzero(kind == number)
+                part = HAZARDS[name](rng, len(rows), self.recording)
+                if part.constant is not None:
+                    constant[rows] = part.constant
+                ghost = np.zeros(len(part.time), bool) if part.ghost is None else part.ghost
+                parts.append((rows[part.waveform], part.time, part.amplitude, part.sigma, ghost))
+            waveform, time, amplitude, sigma, ghost = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+            rows = np.lexsort((time, waveform))
+            return Drawn(waveform[rows], time[rows], amplitude[rows], sigma[rows], ghost[rows], constant)
         if self.canopy:
             return self.canopy.draw(rng, n, self.recording)
         edges = np.cumsum(self.counts)

@@ -22,7 +22,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
-from wavebatch.core.waveforms import Radiometry, SystemPulse
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
@@ -35,7 +35,7 @@ from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request, widest_chain
-from wavebatch.surveying.flat_ground import GroundReference, sample_reference
+from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.inspect_strip import name_gains
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
@@ -217,7 +217,14 @@ def voxelize_strip(
                 )
             beam = sample_reference(reader, scan, source, pulse, setup.choice.survey.figures.spacing_ns or 0.0)
             doubts += tuple(filter(None, [source.doubt(), beam.doubt()]))
-            section_error = _measure_error(setup.system.radiometry, beam, source.distance)
+            # The relative error that all cross sections share: of constant, air, ranges and beam.
+            light = setup.system.radiometry
+            constant = max((error for _, error in light.channels.values()), default=light.constant_error)
+            shared = backscatter_error(
+                np.zeros(1), np.array([source.distance or USUAL]), light.sensor_error, constant, light.attenuation,
+                power=4, attenuation_err=light.attenuation_error,
+            )  # fmt: skip
+            section_error = math.hypot(float(shared[0]), 2.0 * (beam.doubt_error() or light.divergence_error))
         middle = _find_middle(reader, scan, options)
         floor, ceiling, shown = rays.Floor(middle), rays.Ceiling(middle, options.size), np.zeros(256, np.int64)
         for begin, end in pairwise(scan.borders.tolist()):
@@ -295,16 +302,6 @@ def voxelize_strip(
             split = summary.several_packets > 0 or scan.with_waveform == scan.packets
             summary.warnings += (*_doubt_returns(shown.reshape(16, 16), summary.pulses, split),)
             return summary
-
-
-def _measure_error(radiometry: Radiometry, beam: GroundReference, distance: float | None) -> float:
-    """Relative error that all cross sections of a strip share: of constant, air, ranges and beam."""
-    constant = max((error for _, error in radiometry.channels.values()), default=radiometry.constant_error)
-    shared = backscatter_error(
-        np.zeros(1), np.array([distance or USUAL]), radiometry.sensor_error, constant, radiometry.attenuation,
-        power=4, attenuation_err=radiometry.attenuation_error,
-    )  # fmt: skip
-    return math.hypot(float(shared[0]), 2.0 * (beam.doubt_error() or radiometry.divergence_error))
 
 
 def _doubt_returns(shown: np.ndarray, found: int, split: bool) -> Iterator[str]:
