@@ -8,18 +8,19 @@ import sys
 import pytest
 from writer_tools import data_file
 
-from wavebatch.batch.workers.worker_check import describe_processor, probe_arithmetic
+from wavebatch.batch.workers.worker_check import describe_worker, probe_arithmetic
 from wavebatch.tools.simulate import simulate_strip
 
 
 def test_the_probe_is_the_same_each_time():
-    assert describe_processor() == describe_processor()
-    assert probe_arithmetic() == probe_arithmetic() and len(describe_processor()["probe"]) == 16
-    assert describe_processor()["name"]
+    found = describe_worker()
+    assert found == describe_worker.__wrapped__()
+    assert probe_arithmetic() == probe_arithmetic() and len(found["probe"]) == 16
+    assert found["name"]
 
 
 def test_threads_are_no_other_kind():
-    code = "from wavebatch.batch.workers.worker_check import describe_processor; print(describe_processor()['probe'])"
+    code = "from wavebatch.batch.workers.worker_check import describe_worker; print(describe_worker()['probe'])"
     found = set()
     for threads in ("1", "2", "4"):
         env = {**os.environ, "OPENBLAS_NUM_THREADS": threads}

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import laspy
 import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 from scoring import score
 
+import wavebatch
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.surveying import Decision, Survey, survey_block
@@ -16,10 +18,10 @@ from wavebatch.surveying.choose_chain import (
     choose_chain,
     decide,
     widest_chain,
-    without_columns,
 )
 from wavebatch.surveying.systems.figures import Figures
-from wavebatch.tools.simulate import find_pulse
+from wavebatch.tools.simulate import find_pulse, simulate_strip
+from wavebatch.tools.simulate.render import PulseModel
 
 OPEN_FIGURES = Figures(empty_share=0.2, overlapped_share=0.0005)
 DECISIONS = (
@@ -91,9 +93,13 @@ def test_no_widths_of_an_undersampled_pulse():
     chain = choose_chain(survey)
     assert "attribute.echo_width" not in _stages(chain)
     assert "# echo width: left out: the system pulse is 0.64" in chain_text(survey)
-    columns = ("amplitude", "echo_width", "echo_flags", "echo_width_err", "echo_time")
-    assert without_columns(columns, widest_chain(), chain) == ("amplitude", "echo_flags", "echo_time")
-    assert without_columns(columns, widest_chain(), widest_chain()) == columns
+
+
+def test_columns_that_the_chosen_chain_leaves_out_are_not_written(tmp_path):
+    simulate_strip(make_scene("flat", pulse=PulseModel(0.6)), tmp_path / "s.las", pulses=1000)
+    wavebatch.run(tmp_path / "s.las", tmp_path / "out")
+    columns = [*laspy.read(tmp_path / "out" / "s.laz").point_format.extra_dimension_names]
+    assert columns == ["amplitude", "amplitude_err", "range_err", "echo_flags"]
 
 
 def test_a_reason_of_several_lines_stays_one_comment():

@@ -39,7 +39,7 @@ from wavebatch.kernels.geometry.normals import find_edges
 from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Solved, Step
 from wavebatch.surveying.calibration import needs_sensor
-from wavebatch.surveying.choose_chain import ChainChoice, try_chain, without_columns
+from wavebatch.surveying.choose_chain import ChainChoice, try_chain
 from wavebatch.surveying.flat_ground import (
     GroundReference,
     angle_parameters,
@@ -165,7 +165,9 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
             if setup.stranger:
                 job = replace(job, request=replace(job.request, system=None))
             choice = try_chain(reader, scan, setup.choice, job.request)
-            columns = without_columns(job.columns, job.chain, choice.chain)
+            # Without the columns that the widest chain computes and the chosen one does not.
+            lost = set(job.chain.makes) - set(choice.chain.makes)
+            columns = tuple(name for name in job.columns if name not in lost)
             job = replace(job, chain=choice.chain, columns=columns, calibration=setup.calibration)
             surveyed = Seconds.now()
             if job.chain.second_step is not None:

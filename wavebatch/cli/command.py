@@ -82,10 +82,20 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
     options = _list_options(command)
     named = parsed.get("config") or options["config"].resolve_envvar_value(context)
     personal = Path(named or os.path.join(click.get_app_dir("wavebatch"), FILE))
-    beside = None if named else _find_file(parsed)
-    found: dict[Path, dict[str, Any]] = {}
-    if beside is not None:
-        found[beside] = _read_file(beside, title, options, is_users=False)
+    words: list[str] = []
+    for name in _INPUTS:
+        value = parsed.get(name)
+        words += [value] if isinstance(value, str) else list(value) if isinstance(value, tuple | list) else []
+    beside = {}
+    for folder in () if named else map(_folder, words):
+        path = folder / FILE
+        # os.path.isfile is false for names that the system refuses, such as one that is too long: `run` says so.
+        beside[os.path.realpath(path) if os.path.isfile(path) else ""] = path
+    if len(beside) > 1:
+        files = ", ".join(str(path) for key, path in beside.items() if key)
+        raise click.UsageError(f"the inputs lie in folders with different settings ({files}); run them one by one, or "
+                               "give --config FILE")
+    found = {path: _read_file(path, title, options, is_users=False) for key, path in beside.items() if key}
     if named or os.path.isfile(personal):
         given = {name for values in found.values() for name in values}
         barred = given.union(*(rivals for rivals in EXCLUSIVE if given.intersection(rivals)))
@@ -165,25 +175,6 @@ def _list_options(command: click.Command) -> dict[str, click.Option]:
 def _option_name(option: click.Option) -> str:
     """The long name without its hyphens."""
     return max(option.opts, key=len).removeprefix("--")
-
-
-def _find_file(parsed: Mapping[str, Any]) -> Path | None:
-    """wavebatch.toml in the folder of the inputs; ConfigError where they lie in folders with different ones."""
-    words: list[str] = []
-    for name in _INPUTS:
-        value = parsed.get(name)
-        words += [value] if isinstance(value, str) else list(value) if isinstance(value, tuple | list) else []
-    found = {}
-    for word in words:
-        folder = _folder(word)
-        path = folder / FILE
-        # os.path.isfile is false for names that the system refuses, such as one that is too long: `run` says so.
-        found[os.path.realpath(path) if os.path.isfile(path) else ""] = path
-    if len(found) > 1:
-        files = ", ".join(str(path) for key, path in found.items() if key)
-        raise click.UsageError(f"the inputs lie in folders with different settings ({files}); run them one by one, or "
-                               "give --config FILE")
-    return next((path for key, path in found.items() if key), None)
 
 
 def _folder(word: str) -> Path:

@@ -228,6 +228,7 @@ def stages(name: str | None, **options: Any) -> None:
       # one with parameters, units, source and a TOML example
       wavebatch stages decompose.adaptive
     """
+    from wavebatch.core.echoes import COLUMNS
     from wavebatch.stages.chain import KINDS, STAGES
     from wavebatch.stages.chain_file import load_plugins
 
@@ -238,11 +239,28 @@ def stages(name: str | None, **options: Any) -> None:
         hint = nearest(name, STAGES)
         raise ConfigError(f"no stage {name!r}; {hint if '?' in hint else '`wavebatch stages` lists them'}")
     order = list(KINDS)
-    one = name is not None and kind is None
     chosen = sorted(STAGES.values(), key=lambda s: (order.index(s.kind), s.name))
     chosen = [stage for stage in chosen if name in (None, stage.name, stage.kind)]
     width = max(len(stage.name) for stage in chosen)
-    lines = [_explain(STAGES[name])] if one else [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
+    if name is not None and kind is None:
+        only = STAGES[name]
+        described = _describe(only)
+        parts = [f"{only.name}\n\n{described['text']}"]
+        if only.makes:
+            known = [COLUMNS[made] for made in only.makes if made in COLUMNS]
+            parts.append("Makes:\n" + "\n".join(f"  {c.name} [{c.unit}]: {c.meaning}" for c in known))
+        if described["needs"]:
+            parts.append(f"Needs: {', '.join(described['needs'])}")
+        lines = []
+        for key, p in described["parameters"].items():
+            limits = f", {p['range'][0]:g} to {p['range'][1]:g}" if p["range"] else ""
+            lines.append(f"  {key} ({p['type']}{limits}, default {p['default']}): {p['meaning']}")
+        if lines:
+            parts.append("Parameters:\n" + "\n".join(lines))
+        parts.append("In a chain file:\n\n" + described["example"].rstrip())
+        lines = ["\n\n".join(parts)]
+    else:
+        lines = [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
     answer([_describe(stage) for stage in chosen], Sheet("stages", list(map(Note, lines))))
 
 
@@ -272,24 +290,3 @@ def _describe(stage: Stage) -> dict[str, Any]:
         "parameters": parameters,
         "example": format_step(stage.name, {name: one["default"] for name, one in parameters.items()}),
     }
-
-
-def _explain(stage: Stage) -> str:
-    """The stage as text."""
-    from wavebatch.core.echoes import COLUMNS
-
-    described = _describe(stage)
-    parts = [f"{stage.name}\n\n{described['text']}"]
-    if stage.makes:
-        known = [COLUMNS[name] for name in stage.makes if name in COLUMNS]
-        parts.append("Makes:\n" + "\n".join(f"  {c.name} [{c.unit}]: {c.meaning}" for c in known))
-    if described["needs"]:
-        parts.append(f"Needs: {', '.join(described['needs'])}")
-    lines = []
-    for name, p in described["parameters"].items():
-        limits = f", {p['range'][0]:g} to {p['range'][1]:g}" if p["range"] else ""
-        lines.append(f"  {name} ({p['type']}{limits}, default {p['default']}): {p['meaning']}")
-    if lines:
-        parts.append("Parameters:\n" + "\n".join(lines))
-    parts.append("In a chain file:\n\n" + described["example"].rstrip())
-    return "\n\n".join(parts)

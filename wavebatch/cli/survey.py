@@ -62,11 +62,12 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
       # save both for `run --system` and `--chain`
       wavebatch survey strip.las -o system.toml --chain chain.toml
     """  # fmt: skip
+    from wavebatch.files.figure_file import check_picture
     from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, format_survey
     from wavebatch.surveying.systems.figures import describe_figures, describe_system
     from wavebatch.surveying.systems.known_systems import doubt_survey, find_likeness, find_source
-    from wavebatch.tools.sheets.survey import check_angles, list_doubts, survey_page, survey_sheet
+    from wavebatch.tools.sheets.survey import list_doubts, survey_page, survey_sheet
 
     angles, html_file, overwrite = options["angles"], options["html_file"], options["overwrite"]
     paths = shared.find_inputs(strips, recursive=options["recursive"])
@@ -78,7 +79,7 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
         if len(paths) > 1:
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
-        check_angles(angles, overwrite=overwrite)
+        (check_target if angles.suffix.lower() == ".csv" else check_picture)(angles, overwrite=overwrite)
     keeps = bool(output or html_file or options["as_json"])
     saved, facts = _survey(paths[0], options, keeps=keeps) if len(paths) == 1 else _survey_together(paths, options)
     survey = saved.survey

@@ -118,23 +118,6 @@ def _comment(decision: Decision) -> str:
     return f"# {decision.part}: {'kept' if decision.needed else 'left out'}: {reason}"
 
 
-def without_columns(columns: tuple[str, ...], widest: Chain, chain: Chain) -> tuple[str, ...]:
-    """Drop the columns that the widest chain computes and the chosen one does not.
-
-    Parameters
-    ----------
-    columns : tuple of str
-        Chosen for the widest chain.
-    widest, chain : Chain
-
-    Returns
-    -------
-    tuple of str
-    """
-    lost = set(widest.makes) - set(chain.makes)
-    return tuple(name for name in columns if name not in lost)
-
-
 def widest_chain() -> Chain:
     """Return the automatic chain with all parts: its columns are those that a user can ask for."""
     return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0))

@@ -30,14 +30,36 @@ from wavebatch.core.process import CHILD
 
 @functools.cache
 def describe_worker() -> dict[str, str]:
-    """Return what results depend on, of this process: versions of packages, and the kind of the processor."""
+    """Return what results depend on, of this process: versions of packages, and the kind of the processor.
+
+    Returns
+    -------
+    dict
+        `name`: the processor, for people; `probe`: equal on two machines if and only if arithmetic gave the same bits
+        on both; `python`, `wavebatch`, `numpy`, `scipy`.
+
+    Notes
+    -----
+    The probe runs in a process of one thread: threads share out large products, which none of wavebatch's are, and
+    change their last bits.
+
+    References
+    ----------
+    docs/reliability.md, "The same bytes".
+    """
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
     files = sorted(Path(wavebatch.__file__).parent.rglob("*.py"))
     return {
         "python": ".".join(platform.python_version_tuple()[:2]),
         "wavebatch": f"{wavebatch.__version__} {zlib.crc32(b''.join(file.read_bytes() for file in files)):08x}",
         "numpy": numpy.__version__,
         "scipy": scipy.__version__,
-        **describe_processor(),
+        "name": name,
+        "probe": _probe_alone(),
     }
 
 
@@ -92,31 +114,6 @@ _PROBE = "from wavebatch.batch.workers.worker_check import probe_arithmetic; pri
 
 _SIZES = ((3, 40), (13, 80), (19, 200), (64, 300))
 """Parameters and samples of the systems that are solved: from one echo in a window to the stack of a pulse."""
-
-
-def describe_processor() -> dict[str, str]:
-    """Return the kind of the processor of this process.
-
-    Returns
-    -------
-    dict
-        `name` for people; `probe`: equal on two machines if and only if arithmetic gave the same bits on both.
-
-    Notes
-    -----
-    The probe runs in a process of one thread: threads share out large products, which none of wavebatch's are, and
-    change their last bits.
-
-    References
-    ----------
-    docs/reliability.md, "The same bytes".
-    """
-    try:
-        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
-        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return {"name": name, "probe": _probe_alone()}
 
 
 @functools.lru_cache(maxsize=1)

@@ -30,11 +30,6 @@ POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
 """Exponents of the generalized Gaussian that are tried for every cluster."""
 
 
-def _fit_reference(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
-    """The system with the pulse that `reference` fits; of a stretched one the width is that at half maximum."""
-    return system if parameters["model"] == "broadened" else replace(system, components=(), kappa=0.0)
-
-
 def _shape_reference(system: SystemPulse, spacing: float, parameters: Mapping[str, Any]) -> PulseShape:
     """The pulse that `reference` fits."""
     if parameters["model"] == "stretched":
@@ -53,7 +48,15 @@ def _shape_reference(system: SystemPulse, spacing: float, parameters: Mapping[st
     return pulse_shape(system, spacing)
 
 
-@stage("decompose", fits=_fit_reference, shape=_shape_reference, shares=solve.FIT)
+@stage(
+    "decompose",
+    # Of a stretched pulse the width is that at half maximum.
+    fits=lambda system, parameters: (
+        system if parameters["model"] == "broadened" else replace(system, components=(), kappa=0.0)
+    ),
+    shape=_shape_reference,
+    shares=solve.FIT,
+)
 def reference(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
@@ -252,12 +255,13 @@ def fit_each(
 _LOG_NORMAL = solve.FitOptions(max_iterations=60)
 
 
-def _fit_skews(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
-    """Echoes carry their skews, with which they are drawn."""
-    return replace(system, components=(), kappa=0.0)
-
-
-@stage("decompose", makes=("skew", "skew_err"), fits=_fit_skews, shares=_LOG_NORMAL)
+@stage(
+    "decompose",
+    makes=("skew", "skew_err"),
+    # Echoes carry their skews, with which they are drawn.
+    fits=lambda system, parameters: replace(system, components=(), kappa=0.0),
+    shares=_LOG_NORMAL,
+)
 def log_normal(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     origin: Literal["segment", "waveform"] = "segment",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,7 +150,7 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     """Cramer-Rao bounds of time [ns], amplitude [count] and sigma [ns] of every true echo, (m, 3).
 
     All echoes of a waveform are estimated together, the baseline is known; clipped samples have no weight, noise grows
-    with the signal. truth: as tools.simulate gives it; the bounds are those of the terms of `describe_truth`, infinite
+    with the signal. truth: as tools.simulate gives it; the bounds are those of the widths of `make_group`, infinite
     where the samples do not determine them. Source: inverse Fisher matrix, derivatives of the painted pulse by central
     differences.
     """
@@ -158,16 +159,15 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     # Derivatives of each echo alone by time, amplitude and sigma, (m, 3, s).
     each = np.arange(len(truth))
     amplitude, sigma = truth.amplitude.astype(np.float64), truth.sigma.astype(np.float64)
-
-    def paint(time: np.ndarray, width: np.ndarray) -> np.ndarray:
-        return paint_echoes(recording, len(truth), each, time, amplitude, width)
-
+    paint = partial(paint_echoes, recording, len(truth), each)
     step = _STEP * recording.pulse.sigma
-    echo = paint(truth.time, sigma)
-    by_time = (paint(truth.time + step, sigma) - paint(truth.time - step, sigma)) / (2 * step)
+    echo = paint(truth.time, amplitude, sigma)
+    later, earlier = (paint(truth.time + away, amplitude, sigma) for away in (step, -step))
+    by_time = (later - earlier) / (2 * step)
     wider, narrower = sigma + step, sigma - step
     grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
-    by_sigma = (paint(truth.time, wider) - paint(truth.time, narrower)) / np.maximum(grown, 1e-9)[:, None]
+    broad, sharp = (paint(truth.time, amplitude, width) for width in (wider, narrower))
+    by_sigma = (broad - sharp) / np.maximum(grown, 1e-9)[:, None]
     columns = np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64)
     # Samples count by their inverse standard deviation; clipped ones do not.
     signal = np.zeros((n, recording.n_samples))

@@ -131,9 +131,19 @@ def count_values(
             at = np.searchsorted(edges, values, side="right")
             at[values == edges[-1]] = len(edges) - 1
             counts[keys.index(key)] += np.bincount(at, minlength=len(edges) + 1)
+    names = []
+    for cloud, group in keys:
+        parts = [name_paths(clouds.paths)[cloud]] if each and len(clouds.paths) > 1 else []
+        if by is not None:
+            name = clouds.every[1].name
+            meaning = CLASS_NAMES.get(int(group), "") if name.endswith("classification") and group >= 0 else ""
+            known = f"{name} {group:g}" + (f" ({meaning})" if meaning else "")
+            parts.append(f"no {name}" if group == _UNKNOWN else known)
+        whole = clouds.paths[0].name if len(clouds.paths) == 1 else f"{len(clouds.paths)} clouds"
+        names.append(" ".join(parts) or whole)
     return Histogram(
         clouds.facts,
-        tuple(_name_series(key, clouds, each, by) for key in keys),
+        tuple(names),
         total,
         tuple(path.name for path in paths),
         edges,
@@ -180,17 +190,6 @@ def _read_groups(clouds: Clouds, each: bool, by: str | None) -> Iterator[tuple[T
             continue
         group = np.where(np.isnan(rows["values"][:, 1]), _UNKNOWN, rows["values"][:, 1])
         yield tally, cloud, {(number, one): values[group == one] for one in np.unique(group).tolist()}
-
-
-def _name_series(key: _Key, clouds: Clouds, each: bool, by: str | None) -> str:
-    cloud, group = key
-    parts = [name_paths(clouds.paths)[cloud]] if each and len(clouds.paths) > 1 else []
-    if by is not None:
-        column = clouds.every[1].name
-        meaning = CLASS_NAMES.get(int(group), "") if column.endswith("classification") and group >= 0 else ""
-        known = f"{column} {group:g}" + (f" ({meaning})" if meaning else "")
-        parts.append(f"no {column}" if group == _UNKNOWN else known)
-    return " ".join(parts) or (clouds.paths[0].name if len(clouds.paths) == 1 else f"{len(clouds.paths)} clouds")
 
 
 def place_edges(sample: np.ndarray, low: float, high: float, step: float, bins: int | None) -> np.ndarray:

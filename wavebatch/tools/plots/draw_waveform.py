@@ -265,15 +265,13 @@ def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float], h
 
 def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
     """Scales the signal panel to what is shown, with error bars up to half of its height."""
-
-    def inside(time: np.ndarray) -> np.ndarray:
-        return (time >= times[0]) & (time <= times[1])
-
-    echoes = inside(view.echoes.time)
+    echoes, samples, fine = (
+        (time >= times[0]) & (time <= times[1]) for time in (view.echoes.time, view.time, view.fine)
+    )
     peak, error = find_echo_heights(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
-    values = [view.samples[inside(view.time)], [view.baseline - view.std, view.baseline + view.std], peak]
+    values = [view.samples[samples], [view.baseline - view.std, view.baseline + view.std], peak]
     if view.fit is not None:
-        values.append(view.fit[inside(view.fine)])
+        values.append(view.fit[fine])
     shown = np.concatenate(values)
     low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
     room = _ERROR_ROOM * (high - low)

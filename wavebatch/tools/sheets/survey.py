@@ -21,8 +21,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, count, format_measure, format_relative
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock, swath_columns
-from wavebatch.files.disk.publish import check_target
-from wavebatch.files.figure_file import check_picture, open_picture, plain_text, set_head
+from wavebatch.files.figure_file import open_picture, plain_text, set_head
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
@@ -34,7 +33,6 @@ from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Pi
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
-    from wavebatch.surveying.calibration import TargetResult
 
 NOISE_KINDS = {
     "quiet": "quiet samples",
@@ -222,9 +220,14 @@ def _list_calibration(flight: FlightCalibration) -> Iterator[Part]:
         yield Fact("scan angle", f"{sides}, at {math.degrees(most):.1f} deg against straight down")
     yield Fact("conditions", found.conditions)
     tilted = any(one.incidence_deg is not None for one in found.targets)  # a column of reflectances has no angle
-    rows = [(one.label, one.reflectance, one.echoes, _constant(one.constant, one.relative_error or one.spread),
-             one.spread, *[_incidence(one)] * tilted,
-             "used" if one.constant is not None else one.refused or "refused") for one in found.targets]  # fmt: skip
+    rows = []
+    for one in found.targets:
+        incidence, error = one.incidence_deg, one.incidence_error_deg
+        known = "" if incidence is None else f"{incidence:.1f}" + ("" if error is None else f" +- {error:.1f}")
+        angle = Cell(known or "-", "" if incidence is None else incidence)
+        constant = _constant(one.constant, one.relative_error or one.spread)
+        state = "used" if one.constant is not None else one.refused or "refused"
+        rows.append((one.label, one.reflectance, one.echoes, constant, one.spread, *[angle] * tilted, state))
     head = ("target", "reflectance", "echoes", "constant", "spread", *["incidence deg"] * tilted, "")
     yield Table(head, rows, ("", ".4g", "", "", ".1%", *[""] * tilted, ""), sortable=True)
     rows = [(f"digitizer {one.digitizer}, scanner channel {one.scanner}", one.echoes or "by overlap",
@@ -244,13 +247,6 @@ def _list_calibration(flight: FlightCalibration) -> Iterator[Part]:
 def _constant(value: float | None, relative_error: float | None) -> Cell:
     """A constant with as many digits as its error allows."""
     return Cell("-", "") if value is None else Cell(format_relative(value, relative_error or 0.0), value)
-
-
-def _incidence(target: TargetResult) -> Cell:
-    if target.incidence_deg is None:
-        return Cell("-", "")
-    error = "" if target.incidence_error_deg is None else f" +- {target.incidence_error_deg:.1f}"
-    return Cell(f"{target.incidence_deg:.1f}{error}", target.incidence_deg)
 
 
 def _draw_calibration(flight: FlightCalibration) -> Iterator[Picture]:
@@ -346,14 +342,6 @@ def _add_variance(
     zero = np.zeros(len(sigma))
     echoes = EchoTable.build(zero.astype(int), zero, zero + 1.0, sigma, sigma_err=sigma_err)
     return added_variance(block, system, echoes, "system", REFERENCE_ERROR)
-
-
-def check_angles(target: Path, *, overwrite: bool) -> None:
-    """Raises ConfigError or InputError if the table cannot be written there."""
-    if target.suffix.lower() == ".csv":
-        check_target(target, overwrite=overwrite)
-    else:
-        check_picture(target, overwrite=overwrite)
 
 
 def write_angles(

@@ -90,11 +90,6 @@ def trace_rays(flight: FlightLine, terrain: str, pulse: np.ndarray) -> SceneRays
     )
 
 
-def _flat(x: np.ndarray, y: np.ndarray):
-    zero = np.zeros_like(x)
-    return zero, zero, zero
-
-
 def _blocks(x: np.ndarray, y: np.ndarray):
     """Houses 8 to 20 m high, 25 m wide, every 60 m, on level ground."""
     i, j = np.floor(x / 60.0), np.floor(y / 60.0)
@@ -138,7 +133,8 @@ def _village(x: np.ndarray, y: np.ndarray):
 
 
 TERRAINS = {
-    "flat": _flat, "blocks": _blocks, "hills": _hills, "facets": _facets, "beach": _beach, "village": _village,
+    "flat": lambda x, y: 3 * (np.zeros_like(x),),
+    "blocks": _blocks, "hills": _hills, "facets": _facets, "beach": _beach, "village": _village,
 }  # fmt: skip
 """Ground by name: coordinates [m] to height above GROUND [m] and the two slopes."""
 
