@@ -85,3 +85,17 @@ def test_arrays_that_do_not_fit_are_refused(rng):
         describe_whole(whole_pulse(SHAPES["learned"], LIMITS, np.ones(1)), *np.full((2, 1, 3), 50.0), np.zeros((1, 2)))
     with pytest.raises(ValueError, match="as many errors"):
         describe_whole(WholePulse(), np.ones((2, 3)), np.ones((1, 3)), np.ones((2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("limits", "ends"),
+    [
+        ((2.0, 1.0, 30.0), (1.0, 8.0)),  # four widths of the pulse; wider ones have a coarser table
+        ((2.0, 1.6, 30.0), (1.4, 8.0)),  # the same table for all fits that allow no less than .7 widths
+        ((2.0, 1.4, 5.0), (1.4, 5.0)),
+        ((2.0, 9.0, 30.0), (1.4, 9.09)),
+    ],
+)
+def test_the_table_of_usual_widths_is_no_wider_than_fits_allow(limits, ends):
+    near = whole_pulse(SHAPES["learned"], ShapeLimits(*limits), np.ones(1)).near
+    assert near[[0, -1], 0] == pytest.approx(ends)

@@ -143,7 +143,9 @@ def test_an_echo_found_with_every_strong_one_is_a_part_of_the_pulse(scene):
 
 def test_a_survey_says_which_echoes_it_takes_for_a_part_of_the_pulse(tmp_path):
     with wavebatch.open_strip(make_strip(2187, tmp_path)) as strip:
-        reasons = {one.part: one.reason for one in wavebatch.survey(strip).decisions}
+        found = wavebatch.survey(strip)
+    reasons = {one.part: one.reason for one in found.decisions}
+    assert found.system.ringing == 0.0  # what comes before the pulse is no after-pulse
     assert "one of up to 3.0 % of it at -6.0 to -3.7 ns" in reasons["part of the pulse"]
 
 

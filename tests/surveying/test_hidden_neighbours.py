@@ -49,6 +49,8 @@ def test_what_is_hidden_changes_errors_and_no_echo():
     for name in ("time_err", "amplitude_err", "relative_energy_err", "sigma_err"):
         more = getattr(found, name) - getattr(bare, name)
         assert (more >= 0).all() and more.max() > 0, name
+    # An echo of two lies nearer to the brighter one: the light of the other one is less than half of all.
+    assert 0.5 < max(share for _, *shares in system.hidden_light for share in shares) < 1.3
 
 
 def test_a_survey_of_an_earlier_version_is_named(tmp_path):

@@ -437,6 +437,11 @@ def test_cross_sections_are_those_of_the_echoes(level, tmp_path):
     assert np.sum(found["cross_section"], dtype=np.float64) == pytest.approx(expected.sum(), rel=0.02)
     assert list(found)[:3] == ["index", "energy", "cross_section"]
     assert 0.03 < summary.cross_section_error < 0.032  # the constant's, and what ranges add
+    # The area that a beam lights grows with its square.
+    survey = replace(SAVED.survey, system=SAVED.survey.system.with_radiometry(divergence_error=0.1))
+    saved = replace(SAVED, survey=survey)
+    wide, _ = voxelize(level, tmp_path / "x.npz", 1.0, calibration=CALIBRATION, system=saved)
+    assert wide.cross_section_error == pytest.approx(np.hypot(summary.cross_section_error, 0.2), rel=0.01)
     again, _ = voxelize(level, tmp_path / "w.npz", 1.0)
     assert again.sensor is None and again.energy == summary.energy and again.cross_section_error is None
 
