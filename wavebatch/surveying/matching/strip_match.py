@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -25,7 +26,7 @@ from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.attribute.radiometry import AIR_DOUBT
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.calibration import Calibration, ChannelConstant
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.matching import setting as settings
 from wavebatch.surveying.sensor import FOOT, SensorSource
@@ -379,11 +380,8 @@ def match_strip(
         for problem, share in problems.items()
     ]
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
-    # Where the strip itself, known by its fingerprint, was calibrated, its channels have the constants of the strip.
-    of_strip = {(row.digitizer, row.scanner): row for row in calibration.strips if row.sha256 == own_strip}
-    for place, row in enumerate(rows):
-        if (mine := of_strip.get((row.digitizer, row.scanner))) is not None:
-            rows[place] = replace(row, constant=mine.constant, relative_error=mine.relative_error)
+    if calibration.strips:
+        rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
     air = 0.0
     if attenuation is not None and sensor.distance and not later:
         # A strip of the calibration's day that is given other air than the calibration had.
@@ -506,3 +504,16 @@ def _compare_decomposers(
             "--profile"
         )
     return abs(off)
+
+
+def _take_strip_constants(
+    strips: tuple[StripConstant, ...], rows: list[ChannelConstant], key: str
+) -> Iterator[ChannelConstant]:
+    """The rows; where the strip itself, known by its fingerprint, was calibrated, with the constants of the strip."""
+    own = {(row.digitizer, row.scanner): row for row in strips if row.sha256 == key}
+    for row in rows:
+        found = own.get((row.digitizer, row.scanner))
+        if found is None:
+            yield row
+        else:
+            yield replace(row, constant=found.constant, relative_error=found.relative_error)
