@@ -172,17 +172,21 @@ FILES = [
         ("stats cloud.laz -o", "csv"), ("compare cloud.laz cloud.laz -o", "csv"), (f"{RUN} --html", "html"),
         ("simulate flat -o s.laz --truth", "npz"))),
     *((f"{words} empty", 2, "no .las or .laz file; --recursive takes those of") for words in ("check", "stats")),
+    ("import empty", 2, "the folder holds no .pls file; --recursive"),
     *((f"{words.format(name)}", 1, name, {"x.las": "no strip"}) for name in ("x.las", "none.las") for words in (
         "voxelize {} -o v.npz --size 1", f"{HISTOGRAM} --column z {{}}", f"{MAP} --column z {{}}")),
     ("compare strip.las none.las", 2, "none.las"), ("compare cloud.laz broken.laz", 2, "broken.laz"),
     ("compare strip.las x.las", 2, "x.las", {"x.las": "no cloud"}),
     *((f"{RUN} --profile fast --trajectory t.csv", 4, f"t.csv: .. {words}", {"t.csv": text}) for text, words in (
         ("time,x,y,z\n1,2,3,4\n2,3,4,5\n", "do not overlap on any clock"),
-        ("1,2,3,4\n5,6,7,8\n", "no line names the columns"), ("time,x,y\n1,2,3\n", "no line names the columns"),
         ("time,x,y,z\nonly,words,here,now\n", "no line of numbers follows the header in line 1"),
-        ("time,x,y,z\n1,2,3,4\n", "1 usable positions"), ("\n\n", "neither text nor SBET"),
-        ("\0\1\2", "neither text nor SBET"),
+        ("time,x,y,z\n1,2,3,4\n", "1 usable positions"),
         ("time,lat,lon,h\n1,48,11,500\n2,48,11,500\n", "in degrees, but the strip has no CRS"))),
+    *((f"{RUN} --trajectory t.csv", 2, f"t.csv: .. {words}", {"t.csv": text}) for text, words in (
+        ("1,2,3,4\n5,6,7,8\n", "no line names the columns"), ("time,x,y\n1,2,3\n", "no line names the columns"),
+        ("\n\n", "neither text nor SBET"), ("\0\1\2", "neither text nor SBET"))),
+    # A wrong option is named before outputs that exist.
+    ("run strip.las -o . --profile fast --where foo>1", 2, "there is no column 'foo'", {"strip.laz": "old"}),
     *((f"{CALIBRATE} t.csv", 2, f"t.csv: .. {words}", {"t.csv": text}) for text, words in (
         ("name,x\n", "no target in it"), ("reflectance,x,y\n0.2,1,2\n", "target 1: radius is missing"),
         ("x,y,radius\n1,2,3\n", "target 1: reflectance is missing"),

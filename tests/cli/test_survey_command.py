@@ -14,6 +14,7 @@ from wavebatch.surveying import Survey
 from wavebatch.surveying.choose_chain import chain_text, decide
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems.figures import Figures, describe_figures
+from wavebatch.surveying.systems.survey_result import Tried
 from wavebatch.tools.sheets.sheet import list_lines
 from wavebatch.tools.sheets.survey import NOISE_KINDS, survey_sheet
 from wavebatch.tools.simulate import simulate_strip
@@ -56,6 +57,14 @@ def test_the_text_has_every_measure_and_every_decision(flat_strip, surveyed):
         assert any(line.startswith(f"  {word}") and decision.part in line and decision.reason in line for line in lines)
     assert any("s_ref 2.0" in line for line in lines) and any(line.endswith("  chosen") for line in lines)
     assert str(folder / "SYSTEM.toml") in result.stderr and str(folder / "CHAIN.toml") in result.stderr
+
+
+@pytest.mark.parametrize(("longer_by", "said"), [(-13.5, True), (4.2, False)])
+def test_a_pulse_that_describes_shorter_and_is_not_chosen_has_its_reason(longer_by, said):
+    tried = [Tried("all echoes", 4.45, 3, 0.003, 86.2, longer_by, 1.117, False),
+             Tried("riegl-q680i", 4.43, 5, 0.003, 87.2, 0.0, 1.116, True)]  # fmt: skip
+    sheet = survey_sheet(Survey(SystemPulse(1.9), waveforms=0, candidates=tuple(tried)), {"decisions": []})
+    assert ("saves too little per echo, or needs more echoes" in "\n".join(list_lines(sheet))) == said
 
 
 def test_the_files_say_the_same(flat_strip, surveyed):

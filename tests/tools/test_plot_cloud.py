@@ -141,13 +141,17 @@ def test_ours_comes_before_the_vendors_but_the_vendors_own_name_wins(tmp_path):
     path = write_cloud(
         tmp_path / "both.las", n=30,
         Amplitude=(stored.astype("u2"), None, 0.01, "Echo signal amplitude [dB]"),
-        **{"wb_amplitude": (stored.astype("f4"), None, None, "peak above the baseline [DN]")},
+        wb_amplitude=(stored.astype("f4"), None, None, "peak above the baseline [DN]"),
+        amplitude_err=(stored.astype("f4"), None, None, "1 sigma [DN]"),
     )  # fmt: skip
     for asked, unit in (("amplitude", "DN"), ("Amplitude", "dB")):
         with ColumnReader(path, asked) as reader:
             assert reader.facts[0].unit == unit
     with ColumnReader(path, "Amplitude") as reader:
         assert next(reader.read_pieces())["values"][:, 0] == pytest.approx(stored * 0.01)
+    for asked in ("amp", "amplitde"):  # the name of ours, not that of its error or of the vendor's
+        with pytest.raises(ConfigError, match=f"no column '{asked}'; did you mean 'amplitude'"):
+            ColumnReader(path, asked)
 
 
 def test_each_cloud_has_its_series_and_all_together_are_their_sum(cloud, tmp_path):

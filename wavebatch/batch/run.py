@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.job import StripJob, plan_filter, plan_layout
+from wavebatch.batch.job import StripJob, plan_layout
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing, cloud_path, report_path
 from wavebatch.batch.strip_task import StripTask
@@ -456,7 +456,6 @@ def plan_strip(job: StripJob, options: RunOptions) -> dict[str, Any]:
     done = task.start(jobs=1) is not None
     facts = task.facts
     layout, is_laz = plan_layout(job, facts), job.options.format == "laz"
-    plan_filter(job, layout)
     return {
         "action": "skip" if done else "write",
         "strip": str(job.path),

@@ -20,7 +20,7 @@ import numpy as np
 
 from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.job import StripJob
+from wavebatch.batch.job import StripJob, plan_filter, plan_layout
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.report_file import find_remarks, find_warnings
 from wavebatch.batch.unit import Packing, Prepared, UnitResult, pack_chunk, prepare_strip, process_unit, scan_run
@@ -102,6 +102,8 @@ class StripTask:
         ------
         InputError
             Where the strip cannot be read, or its outputs exist and may not be replaced.
+        ConfigError
+            Where columns, format or --where do not fit the strip.
         """
         options, job = self._options, self.job
         with job.open() as reader:
@@ -114,6 +116,7 @@ class StripTask:
         self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
         if options.resume and (report := report_file.read_current(job, options.folder, self._described)) is not None:
             return report
+        plan_filter(job, plan_layout(job, self.facts))  # a wrong option is named before outputs that exist
         for target in (report_file.cloud_path, report_file.report_path):
             check_target(target(job, options.folder), overwrite=options.overwrite or options.resume)
         return None

@@ -154,7 +154,6 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
     start = Seconds.now()
     with job.open() as reader:
         facts = reader.facts
-        plan_filter(job, plan_layout(job, facts))
         scan = reader.scan(force=job.request.force, parts=parts)
         with undoing(scan.close):
             scanned = Seconds.now()

@@ -203,7 +203,7 @@ def _list_parts(one: Comparison) -> Iterator[Part]:
     for title, classes_by in (("missed, of B's", one.missed_by), ("extra, of A's", one.extra_by)):
         rows = [(kind, str(name), alone, of, alone / of)
                 for kind, classes in classes_by.items() for name, (alone, of) in classes.items() if alone]  # fmt: skip
-        if rows:
+        if rows and one.matched:  # else all lines would say 100 %
             head = (title, "", "number", "of", "share")
             yield Sheet(f"Echoes {title}", [Table(head, rows, ".2%", sortable=True)])
 

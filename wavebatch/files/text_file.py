@@ -184,7 +184,7 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
             return
     *names, last = [suffix for suffixes in kinds for suffix in suffixes]
     hint = "; --recursive takes those of its subfolders too" if os.path.isdir(path) and not recursive else ""
-    raise ConfigError(f"{problem} no {', '.join(names)} or {last} file{hint}")
+    raise ConfigError(f"{problem} no {' or '.join(filter(None, (', '.join(names), last)))} file{hint}")
 
 
 def _walk(folder: Path) -> list[str]:

@@ -24,6 +24,9 @@ MOST_RECORDS = 400_000
 MOST_TEXT = 1 << 30
 """Most bytes of a text file: it is kept in memory."""
 
+MOST_HEAD = 1 << 20
+"""Bytes among which the names of the columns stand: 200 lines of 5,000 characters."""
+
 MOST_NAME = 100
 """Most characters of the name of a column."""
 
@@ -63,9 +66,8 @@ def read_trajectory(
         If the file cannot be read or does not have what is needed.
     """
     path = Path(path)
-    with reporting_reads(path, "trajectory "), open_regular(path) as file:
-        size, head = path.stat().st_size, file.read(4096)
-    if size and size % SBET_RECORD.itemsize == 0 and b"\0" in head:
+    size, is_sbet = check_trajectory(path)
+    if is_sbet:
         records = np.memmap(path, SBET_RECORD, "r")
         step = max(1, -(-len(records) // MOST_RECORDS))
         names = ("time", "latitude", "longitude", "height", *_ATTITUDE, "wander")
@@ -81,8 +83,6 @@ def read_trajectory(
             columns["heading"] -= wander
             for name in ("latitude", "longitude"):
                 columns[name] = np.degrees(columns[name])
-    elif b"\0" in head or not head.strip():
-        raise InputError(f"{path}: trajectory is neither text nor SBET (records of {SBET_RECORD.itemsize} bytes)")
     else:
         columns = _read_text(path, size)
     if "x" in columns:
@@ -112,19 +112,42 @@ def read_trajectory(
         return Trajectory.build(columns["time"], xyz)
 
 
+def check_trajectory(path: Path) -> tuple[int, bool]:
+    """Look at the beginning of a trajectory only, which takes no time; return its size and whether it is an SBET.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is neither an SBET nor text whose columns have names.
+    """
+    with reporting_reads(path, "trajectory "), open_regular(path) as file:
+        size, head = path.stat().st_size, file.read(MOST_HEAD)
+    is_binary = b"\0" in head[:4096]
+    if is_binary and size % SBET_RECORD.itemsize == 0:
+        return size, True
+    if is_binary or not head.strip():
+        raise InputError(f"{path}: trajectory is neither text nor SBET (records of {SBET_RECORD.itemsize} bytes)")
+    _find_names(path, head.decode("utf-8", "replace").splitlines())
+    return size, False
+
+
+def _find_names(path: Path, lines: list[str]) -> tuple[int, list[str]]:
+    """The line that names the columns, and what they mean; InputError where there is none."""
+    for place, line in enumerate(lines[:200]):
+        found = [_meaning(field) for field in _split(line)]
+        if "time" in found and ({"x", "y", "z"} <= set(found) or {"latitude", "longitude", "z"} <= set(found)):
+            return place, found
+    raise InputError(
+        f"{path}: no line names the columns of the trajectory; the first line must hold time, x, y, z "
+        "(or time, latitude, longitude, height)"
+    )
+
+
 def _read_text(path: Path, size: int) -> dict[str, np.ndarray]:
     if size > MOST_TEXT:
         raise InputError(f"{path}: {size / 1e9:.1f} GB of text are too much; thin it to 20 positions per second")
     lines = path.read_text("utf-8", "replace").splitlines()
-    for place in range(min(len(lines), 200)):
-        found = [_meaning(field) for field in _split(lines[place])]
-        if "time" in found and ({"x", "y", "z"} <= set(found) or {"latitude", "longitude", "z"} <= set(found)):
-            break
-    else:
-        raise InputError(
-            f"{path}: no line names the columns of the trajectory; the first line must hold time, x, y, z "
-            "(or time, latitude, longitude, height)"
-        )
+    place, found = _find_names(path, lines)
     names = [name if name not in found[:i] else "" for i, name in enumerate(found)]
     body = (_split(line) for line in lines[place + 1 :])
     rows = [row for row in (_numbers(fields, len(names)) for fields in body) if row is not None]

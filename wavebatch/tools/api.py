@@ -20,12 +20,13 @@ from wavebatch.batch.run import BatchResult, check_outputs, plan_memory, run_bat
 from wavebatch.core.errors import ConfigError, InputError, nearest
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.disk.raw_bytes import Closing, open_regular, reporting_reads
+from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.pulse_energy import NONE
 from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import StripScan
 from wavebatch.files.text_file import find_strips
+from wavebatch.files.trajectory_file import check_trajectory
 from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages import chain_file
 from wavebatch.stages.chain import Chain
@@ -364,8 +365,7 @@ def plan_run(
     if sensor.trajectory is not None:
         # Once, not for each strip after its survey.
         try:
-            with reporting_reads(sensor.trajectory, "trajectory "), open_regular(sensor.trajectory):
-                pass
+            check_trajectory(sensor.trajectory)
         except InputError as error:
             raise ConfigError(str(error)) from error
     given = {

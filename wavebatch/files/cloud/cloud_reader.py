@@ -257,7 +257,7 @@ class CloudReader(Closing):
                 f"{self.path}: has no column {wanted!r}; `wavebatch run` writes {missing} into clouds"
                 + (f": add --columns +{missing}" if self.written else ", and this is none of them")
             )
-        hint = nearest(wanted, known)
+        hint = nearest(wanted, dict.fromkeys([*ours, *known]))  # ours by our names: `amplitude` for wb_amplitude
         has = "" if hint.startswith("known") else f" Columns of the file: {', '.join(known)}"
         raise ConfigError(f"{self.path}: has no column {wanted!r}; {hint}{has}")
 

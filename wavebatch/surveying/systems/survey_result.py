@@ -50,7 +50,7 @@ class Decision:
 
 
 class Tried(NamedTuple):
-    """A pulse that was tried, in a line of `survey -v`."""
+    """A pulse that was tried, in a line of `survey`."""
 
     name: str
     fwhm_ns: float

@@ -107,6 +107,8 @@ def _list_survey(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
              Cell("chosen" if one.chosen else f"{one.longer_by:.1f}", one.longer_by)) for one in survey.candidates]
     # The fewest nats describe a waveform best; the change is that of the pulse from shot to shot.
     yield Table(heads, rows, ("", ".2f", ".3f", ".1%", ".3f", ""))
+    if any(one.longer_by < 0 for one in survey.candidates):
+        yield Note("  below 0: describes the waveforms shorter, but saves too little per echo, or needs more echoes")
     if figures.false_in_noise_share is not None:
         shares = figures.false_in_noise_share, figures.false_by_misfit_share
         by_noise, misfit = (f"{100 * share:.2g}" for share in shares)
