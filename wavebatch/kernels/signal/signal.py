@@ -166,6 +166,11 @@ def quiet_fill(samples: np.ndarray, fill: np.ndarray) -> np.ndarray:
     return quiet
 
 
+def find_varying(samples: np.ndarray) -> np.ndarray:
+    """Waveforms (n, s) whose samples are not all the same, bool (n,): only these have echoes."""
+    return (samples != samples[:, :1]).any(axis=1)
+
+
 def transpose_samples(samples: np.ndarray) -> np.ndarray:
     """Raw counts (n, s) as contiguous float32 (s, n)."""
     return samples.T.astype(np.float32, order="C")

@@ -16,7 +16,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import bound_time, estimate_starts, fit_closed_form, start_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
-from wavebatch.kernels.signal.signal import smooth_121
+from wavebatch.kernels.signal.signal import find_varying, smooth_121
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference, render_table, skew_system, skewed
@@ -265,7 +265,7 @@ def residual_loop(
         limit = np.maximum(t_diff * np.max(block.samples - noise.level, axis=1, initial=0), noise.std)
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
-    varies = (block.samples != block.samples[:, :1]).any(axis=1)
+    varies = find_varying(block.samples)
     parts: list[EchoTable] = []
     while len(rows) or not parts:
         found = _LOOP_FITS[fitted](block, noise, system, echoes, **options)

@@ -21,7 +21,7 @@ from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.runs import find_runs, gap_distance, highest_samples, run_moments, walk_down
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121, transpose_samples
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, find_varying, smooth_121, transpose_samples
 from wavebatch.stages.chain import Range, stage
 
 
@@ -131,8 +131,7 @@ def make_table(
     kept = np.ones(len(waveform), bool)
     if not varies:
         rows, row = np.unique(waveform, return_inverse=True)
-        samples = block.samples[rows]
-        kept = (samples != samples[:, :1]).any(axis=1)[row]
+        kept = find_varying(block.samples[rows])[row]
     if block.missing is not None:
         kept &= gap_distance(block.missing, waveform, time) > -1.0
     columns = (waveform, time * block.spacing, amplitude, width * block.spacing)
