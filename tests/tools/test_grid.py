@@ -206,3 +206,20 @@ def test_cells_in_metres_are_refused_on_degrees(rng, tmp_path):
     words = (tmp_path / "d.las", "--column", "height", "-o", tmp_path / "d.tif")
     assert "coordinates are degrees, and cells of 1 degrees are larger" in _run(*words, code=2).stderr
     _run(*words, "--size", "1e-05")
+
+
+def test_counts_of_two_digitizers_in_one_raster_are_named(tmp_path):
+    """Means of 8-bit and 16-bit amplitudes were written without a word."""
+    for name, bits in (("a", 8), ("b", 16), ("c", 8)):
+        run_command("simulate", "urban", "-o", tmp_path / f"{name}.las", "--pulses", 1500, "--bits", bits)
+        assert run_command("run", tmp_path / f"{name}.las", "-o", tmp_path / "out", "-q").exit_code == 0
+
+    def grid(column, *names):
+        clouds = [tmp_path / "out" / f"{name}.laz" for name in names]
+        done = run_command("grid", *clouds, "--column", column, "-o", tmp_path / "x.tif", "--size", 5, "--overwrite")
+        assert done.exit_code == 0, done.output
+        return " ".join(done.stderr.split())
+
+    said = grid("amplitude", "a", "b")
+    assert "warning: amplitude: counts of" in said and "(8 bits, 1 ns apart)" in said and "(16 bits, 1 ns" in said
+    assert "counts of" not in grid("amplitude", "a", "c") + grid("echo_width", "a", "b")

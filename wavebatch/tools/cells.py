@@ -22,11 +22,13 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
+from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.raw_bytes import undoing
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
+from wavebatch.files.las.header import read_header
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
@@ -142,6 +144,21 @@ class Clouds:
         if tally.no_data:
             reasons.append(f"{tally.no_data} have no data in {self.facts.name}")
         return InputError(f"{where}: nothing to draw: {' and '.join(reasons)}")
+
+
+def name_recordings(paths: Sequence[Path], columns: Sequence[str]) -> str:
+    """Say that columns in counts do not compare, where clouds are of strips with other bits or spacing; else empty."""
+    counts = [facts.name for facts in Clouds(paths, columns).every if "DN" in facts.unit.split()] if columns else []
+    ways: dict[str, Path] = {}
+    for path in paths if counts else ():
+        for run in read_provenance(read_header(path))[-1:]:
+            survey = run.get("survey")
+            figures = survey.get("figures") if isinstance(survey, dict) else None
+            way = [figures.get(key) for key in ("bits", "spacing_ns")] if isinstance(figures, dict) else [None]
+            if all(isinstance(value, int | float) for value in way):
+                ways.setdefault("{:g} bits, {:g} ns apart".format(*way), path)
+    named = " and ".join(f"{path} ({way})" for way, path in [*ways.items()][:2])
+    return f"{', '.join(counts)}: counts of {named} do not compare; take a calibrated column" * (len(ways) > 1)
 
 
 def sample_points(
