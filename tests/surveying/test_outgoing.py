@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import Digitizer, SystemPulse
+from wavebatch.core.waveforms import Digitizer, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import ExtraRecord
 from wavebatch.files.pulse_energy import find_pulse_energy
 from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
+from wavebatch.stages.attribute.radiometry import normalize_amplitude
 from wavebatch.surveying import Survey
 from wavebatch.surveying.matching.strip_energies import take_energies
 from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing
@@ -57,8 +59,9 @@ def sent(tmp_path, rng):
     samples = _samples(rng, 400, 2.0)
     shape = learn_shape(samples, 1.0, find_reference(samples))
 
-    def write(same_receiver=True):
-        saved = save_outgoing(shape, find_reference(samples), 1.0, 8, "a.pls", {}, same_receiver=same_receiver)
+    def write(same_receiver=True, **scatter):
+        reference = find_reference(samples)
+        saved = save_outgoing(shape, reference, 1.0, 8, "a.pls", {}, same_receiver=same_receiver, **scatter)
         (tmp_path / "strip.system.toml").write_text(format_survey(saved))
         return tmp_path / "strip.las", shape.fwhm
 
@@ -89,6 +92,23 @@ def test_the_pulse_that_is_taken_and_why(sent, ratio, learned, same, taken, reas
     # A survey that is saved under the same name is not taken for outgoing pulses.
     strip.with_suffix(".system.toml").write_text(format_survey(SavedSurvey(found)))
     assert compare_outgoing(before, strip) is before
+
+
+def test_pulses_of_various_widths_are_in_the_errors_of_normalized_amplitudes(sent):
+    """Of one energy, a wider pulse is lower: 5 % of it left half of the amplitudes beyond their error."""
+    strip, fwhm = sent(width_scatter=0.05)
+    found = compare_outgoing(_echoes(fwhm), strip).system
+    assert found.widths.scatter == pytest.approx(0.05 * found.sigma_ref)
+    block = WaveformBlock.from_samples(np.zeros((1, 60), np.uint8), spacing=1.0)
+    waveform, time, amplitude, width = np.zeros(1, int), np.full(1, 30.0), np.full(1, 50.0), np.full(1, found.sigma_ref)
+    echoes = EchoTable.build(waveform, time, amplitude, width, amplitude_err=np.ones(1))
+    echoes = echoes.with_attributes(x=np.zeros(1), y=np.zeros(1), z=np.zeros(1))
+    block = replace(block, sensor=np.array([[0.0, 0.0, 1000.0]]), origin=np.zeros((1, 3)), direction=np.zeros((1, 3)))
+    plain, scattered = (
+        normalize_amplitude(block, replace(found, widths=one), echoes, 1000.0)[1][0]
+        for one in (LevelWidths(), found.widths)
+    )
+    assert scattered**2 - plain**2 == pytest.approx(0.05**2)
 
 
 def test_without_a_file_of_outgoing_pulses_nothing_changes(tmp_path, sent):

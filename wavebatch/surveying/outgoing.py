@@ -227,5 +227,7 @@ def compare_outgoing(found: Survey, strip: Path) -> Survey:
     figures = replace(found.figures, sent_fwhm_ns=theirs, sent_time_error_ns=sent.figures.outgoing_time_error_ns)
     shape = ("sigma_ref", "components", "kappa", "ringing")
     pulse = {name: getattr(sent.system, name) for name in shape} if take else {}
-    system = replace(found.system, **pulse)
+    # Pulses of various widths scatter those of echoes, and their heights.
+    scatter = max(found.system.widths.scatter, found.system.sigma_ref * (sent.figures.outgoing_width_scatter or 0.0))
+    system = replace(found.system, widths=replace(found.system.widths, scatter=scatter), **pulse)
     return replace(found, system=system, figures=figures, decisions=(*found.decisions, Decision(PART, take, text)))

@@ -235,7 +235,9 @@ def normalize_amplitude(
         value = radiometry.backscatter(air / reference**2, distance, amplitude, 1.0, given.attenuation) / energy
         fit = echoes.amplitude_err.astype(np.float64) / amplitude
     away = np.hypot(given.sensor_error, fit_range_error(echoes))
-    relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, given.attenuation)
+    # Of one energy, a wider pulse is lower.
+    fit = np.hypot(np.hypot(fit, shot_error), system.widths.scatter / system.sigma_ref)
+    relative = radiometry.backscatter_error(fit, distance, away, 0.0, given.attenuation)
     # An error of the attenuation counts over the way by which the range differs from the reference.
     air_error = given.attenuation_error or AIR_DOUBT * given.attenuation
     beyond = 2.0e-4 * log(10.0) * air_error * np.abs(distance - reference)
