@@ -234,3 +234,6 @@ def test_no_data_of_the_strip_in_added_echoes_is_said(riegl, tmp_path):
     cloud = wavebatch.read_cloud(tmp_path / f"{riegl.stem}.laz")
     added = (cloud["echo_flags"] & int(wavebatch.EchoFlag.ADDED)) != 0
     assert added.sum() > 100 and line.split(" added echoes")[0].endswith(str(added.sum()))
+    assert "Amplitude 377.68, Pulse width 3776.8: " in line  # as programs show it, not as it is stored
+    wavebatch.run(riegl, tmp_path / "none", profile="fast", drop_flags="ADDED")
+    assert "added echoes have" not in (tmp_path / "none" / f"{riegl.stem}.report.json").read_text()

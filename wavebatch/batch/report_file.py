@@ -360,16 +360,18 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     if last:
         lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
                      "the ground: return numbers stay those of the whole pulse")  # fmt: skip
-    layout, added = prepared.layout, report.count("added_echoes")
+    layout, added = prepared.layout, report.flags.get("ADDED", 0)  # those that are written
     lines += [*layout.notes, *describe_roundings(layout.written)]
     if added and layout.copied:
         lines.append(
             f"{', '.join(layout.copied)}: kept; {added} added echoes have the value of the nearest return of their "
             "packet, because no value is free for no-data"
         )
-    marked = [f"{one.record.name} {one.record.no_data[0]:g}" for one in layout.carried
-              if not (one.copied or layout.whole or one.record.no_data is None)
-              and math.isfinite(one.record.no_data[0])]  # fmt: skip
+    marked = []
+    for one in layout.carried:
+        if not (one.copied or layout.whole or one.record.no_data is None) and math.isfinite(one.record.no_data[0]):
+            scale, offset = one.record.scaling or (1.0, 0.0)  # a program that takes it for a value scales it
+            marked.append(f"{one.record.name} {one.record.no_data[0] * scale + offset:g}")
     if added and marked:
         lines.append(
             f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
