@@ -167,6 +167,12 @@ def test_neighbours_raise_neither_misfit_nor_significance(number, tmp_path):
     assert result["right"] and result["missed"] < 0.03
 
 
+def test_echoes_hidden_in_the_noise_are_not_taken_for_it(tmp_path):
+    """Short packets full of leaves: noise was 1.4 times as large, 4 % of the clear echoes were lost."""
+    result = judge_strip(2395, tmp_path)
+    assert result["right"] and result["missed"] < 0.02 and result["extra"] < 0.01
+
+
 @pytest.mark.quick_cases("2022")
 @pytest.mark.parametrize("number", [2022, 1920])
 def test_an_undershoot_that_was_cut_off_hides_no_echo(number, tmp_path):

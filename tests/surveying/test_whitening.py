@@ -7,6 +7,7 @@ import pytest
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import maximum
@@ -14,7 +15,7 @@ from wavebatch.stages.noise import pooled
 from wavebatch.stages.pulse_tables import noise_factors, pulse_shape
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block
-from wavebatch.surveying.measuring.whitening import choose_whitening
+from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import simulate_again
 
 SIGMA, NOISE, LENGTH, RHO = 2.0, 3.0, 80, 0.8
@@ -122,3 +123,24 @@ def test_waveforms_are_simulated_again_with_the_noise_that_fits_whiten():
     assert noise.std() == pytest.approx(system.noise.quiet, rel=0.03)
     for lag, share in ((1, RHO), (2, RHO**2), (4, RHO**4)):
         assert np.mean(noise[:, lag:] * noise[:, :-lag]) / noise.var() == pytest.approx(share, abs=0.02)
+
+
+@pytest.mark.parametrize(("kind", "lowered"), [("echoes", True), ("slow", False), ("white", False)])
+def test_weak_echoes_are_taken_off_the_noise_and_slow_noise_is_not(kind, lowered):
+    """Both are correlated as far as a pulse reaches, and descriptions are shorter with less of either."""
+    rng, n, width = np.random.default_rng(3), 500, 6.0
+    x, slow = np.arange(150), rng.standard_normal((350, n))
+    for i in range(1, 350):
+        slow[i] = 0.98 * slow[i - 1] + np.sqrt(1 - 0.98**2) * slow[i]
+    y = 200 + rng.standard_normal((n, 150)) + (0.7 * slow[200:].T if kind == "slow" else 0)
+    for low, high, number in ((20, 200, 1), (1.2, 2.4, 3 if kind == "echoes" else 0)):
+        for _ in range(number):
+            z = (x - rng.uniform(0, 150, (n, 1))) / width
+            y += rng.uniform(low, high, (n, 1)) * np.exp(-0.5 * z * z)
+    block = WaveformBlock.from_samples(np.rint(y).astype(np.uint16))
+    lags = tuple(0.11 * np.exp(-np.arange(20) / 20))
+    noise = ReceiverNoise(baseline=200.0, std=1.1 * noise_factors(GAUSSIAN, width, lags)[0], by_kind={"quiet": 1.1},
+                          correlation=lags)  # fmt: skip
+    found = lower_noise(block, SystemPulse(sigma_ref=width, noise=noise))
+    assert (found.std < 0.95 * noise.std) == lowered and (found is noise) == (not lowered)
+    assert found.std >= 1.1 and noise.std > 1.5

@@ -48,7 +48,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_samples,
 )
 from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, measure_residuals
-from wavebatch.surveying.measuring.whitening import choose_whitening
+from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import (
@@ -261,6 +261,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
+        noise = lower_noise(part, replace(borne, noise=system.noise))
+        if noise is not system.noise:
+            system, borne = replace(system, noise=noise), replace(borne, noise=noise)
+            echoes = decompose_sample(part, borne)
         tailed = measure_tail(block, system, clear)
         system = find_parts(part, tailed, echoes)
         repeated = sorted(set(system.tail_misfit) - set(tailed.tail_misfit))

@@ -1,16 +1,19 @@
-"""Whether the fits of a strip whiten its noise (docs/algorithms.md H11); the survey asks once pulse and noise stand."""
+"""Noise once the pulse stands: what weak echoes add to it, and whether fits whiten it (docs/algorithms.md H10, H11)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
-from wavebatch.surveying.measuring.judge import SURE, describe_waveforms, exceed, explain
-from wavebatch.surveying.measuring.noise_and_width import FEW, find_single, thin_samples
+from wavebatch.stages.pulse_tables import noise_factors, pulse_shape
+from wavebatch.surveying.measuring.judge import SURE, Explained, count_errors, describe_waveforms, exceed, explain
+from wavebatch.surveying.measuring.mirror import look_in_mirror
+from wavebatch.surveying.measuring.noise_and_width import DITHERED, FEW, UNDITHERED, find_single, thin_samples
 
 LEAST_NOISE = 0.5
 """Noise of a sample below which rounding makes what a filter of neighbours sees [count]."""
@@ -29,6 +32,67 @@ STRONG = 20.0
 MOST_LEFT = 1.3
 """chi2 per sample of these fits up to which it does: beyond, the pulse misses its echoes by more than the noise, and a
 filter for noise makes more of that."""
+
+LOWER = 0.9
+"""Step by which less noise is tried: that of a significance in `settle`, over its first."""
+
+LESS = 0.97
+"""Noise over another one up to which it is less: it moves one echo in a hundred."""
+
+
+def lower_noise(block: WaveformBlock, system: SystemPulse) -> ReceiverNoise:
+    """Take off the noise what echoes too weak to be found add to it, as long as two judges agree.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        A sample of the strip.
+    system : SystemPulse
+        Its pulse and noise, with a misfit.
+
+    Returns
+    -------
+    ReceiverNoise
+        With less noise of a pulse, never less than that of a sample; or that of the system.
+
+    Notes
+    -----
+    With less noise more echoes are found. They are there if the waveforms in which they are found are shorter to
+    describe with them, by SURE, and if the mirror gains less: a description knows of noise what two neighbours say, and
+    slow noise goes as often down as up.
+    """
+    block = thin_samples(block, LOOK)
+    explained: Explained | None = None
+    while True:
+        for noise in _list_lower(system, block.spacing):
+            explained = explained or explain(block, system)
+            lower = replace(system, noise=noise)
+            found = explain(block, lower)
+            longer = np.subtract(*(describe_waveforms(block, system, one, [0.0])[0] for one in (found, explained)))
+            same = np.equal(*(one.echoes.count(len(block)) for one in (found, explained)))
+            if count_errors(np.where(same, 0.0, longer)) < -SURE:
+                before, after = (next(look_in_mirror(block, *one))[1] for one in ((system, explained), (lower, found)))
+                if after.worth > before.worth:
+                    system, explained = lower, found
+                    break
+        else:
+            return system.noise
+
+
+def _list_lower(system: SystemPulse, spacing: float) -> Iterator[ReceiverNoise]:
+    """Less noise: without what two neighbours do not say of its correlation, as weak echoes make it, and by a step."""
+    noise, width = system.noise, system.sigma_ref / spacing
+    near, shares, tried = [1.0, *noise.correlation[:2]], predict_noise(noise.correlation), []
+    if shares is not None and len(near) > 2:
+        while len(near) <= len(noise.correlation):
+            near.append(shares[0] * near[-1] + shares[1] * near[-2])
+        both = (noise_factors(pulse_shape(system, spacing), width, tuple(one)) for one in (near[1:], noise.correlation))
+        less = float(np.divide(*(factors[0] for factors in both)))
+        tried = [replace(noise, std=less * noise.std, correlation=tuple(near[1:]))]
+    least = max(noise.quiet, DITHERED if noise.quiet < UNDITHERED else QUANTISATION_STD)
+    for one in (*tried, replace(noise, std=LOWER * noise.std)):
+        if max(one.std, least) < LESS * noise.std:  # NaN where that correlation is none of a noise
+            yield replace(one, std=max(least, one.std))
 
 
 def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 0.0) -> SystemPulse:
