@@ -171,6 +171,9 @@ def test_echoes_hidden_in_the_noise_are_not_taken_for_it(tmp_path):
     """Short packets full of leaves: noise was 1.4 times as large, 4 % of the clear echoes were lost."""
     result = judge_strip(2395, tmp_path)
     assert result["right"] and result["missed"] < 0.02 and result["extra"] < 0.01
+    with wavebatch.open_strip(make_strip(2395, tmp_path)) as strip:
+        reasons = {one.part: one.reason for one in wavebatch.survey(strip).decisions}
+    assert reasons["hidden echoes in the noise"].startswith("0.65 DN, not 0.76: ")
 
 
 @pytest.mark.quick_cases("2022")

@@ -229,7 +229,7 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
     """As survey_block, from noise and width by `clean_sample`; once more where noise grows with the signal."""
-    first, figures, repeated = system, Figures(), []
+    first, figures, repeated, lowered = system, Figures(), [], 0.0
     candidates: tuple[Tried, ...] = ()
     if learn:
         clear = find_clear(block, system)
@@ -263,6 +263,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
         noise = lower_noise(part, replace(borne, noise=system.noise))
         if noise is not system.noise:
+            lowered = system.noise.std
             system, borne = replace(system, noise=noise), replace(borne, noise=noise)
             echoes = decompose_sample(part, borne)
         tailed = measure_tail(block, system, clear)
@@ -303,6 +304,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     system = measure_skew(part, system, echoes) if learn else system
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
+    if lowered:
+        reason = f"{system.noise.std:.2f} DN, not {lowered:.2f}: echoes found with less are shorter to describe"
+        decisions = (*decisions, Decision("hidden echoes in the noise", True, f"{reason}, and few are in the mirror"))
     if repeated:
         share, lags = max(share for _, share in repeated), f"{repeated[0][0]:+.1f} to {repeated[-1][0]:+.1f} ns"
         reason = f"every strong echo has one of up to {100 * share:.1f} % of it at {lags}: echoes there must be higher"
