@@ -215,7 +215,15 @@ class _Batch:
 
     def run(self) -> None:
         """Work until every strip has an outcome."""
-        while self._submit() or self._active:
+        while True:
+            while sum(len(strip.pending) for strip in self._active) < self._workers.limit:
+                strip = next((strip for strip in self._active if strip.has_more), None) or self._start_next()
+                if strip is None:
+                    break
+                with self._failing(strip):
+                    strip.submit(self._workers)
+            if not self._active:
+                break
             interrupts.check()
             heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
             try:
@@ -231,16 +239,6 @@ class _Batch:
         for strip in self._active:
             strip.drop()
         self._active.clear()
-
-    def _submit(self) -> bool:
-        """Submit calls up to the workers' limit; return whether any is under way."""
-        while sum(len(strip.pending) for strip in self._active) < self._workers.limit:
-            strip = next((strip for strip in self._active if strip.has_more), None) or self._start_next()
-            if strip is None:
-                break
-            with self._failing(strip):
-                strip.submit(self._workers)
-        return any(strip.pending for strip in self._active)
 
     def _start_next(self) -> StripTask | None:
         """Start the next strip that needs work; None where no other strip may start now."""

@@ -82,11 +82,29 @@ def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **
     shared.check_html(options["html_file"])
     if output is not None:
         check_target(output, overwrite=options["overwrite"])
-    result = _match(a, b, strip, options) if strip else _compare(a, b, options)
-    between = result.between if strip else result
+    result: Matchup | Comparison
+    if strip:
+        from wavebatch.core.errors import nearest
+        from wavebatch.surveying.choose_chain import COSTS
+        from wavebatch.surveying.system_file import load_survey
+        from wavebatch.tools.api import AUTO
+        from wavebatch.tools.compare_chains import find_contender, match_sides
+
+        saved = None if options["system"] is None else load_survey(options["system"])
+        sides = [None if side is None else find_contender(str(side)) for side in (a, b)]
+        for side in sides:
+            if side is not None and side.is_cloud and not Path(side.name).exists():
+                chain = nearest(side.name, [AUTO, *COSTS])
+                raise click.UsageError(f"{side.name}: is neither a file nor a shipped chain; {chain}")
+        more = {"survey": saved and saved.survey, "force": options["force"], "limit": options["limit"]}
+        more |= {} if options["within"] is None else {"tolerance_ns": options["within"]}
+        matchup = match_sides(strip, *sides, **more)
+        result, between, chains = matchup, matchup.between, _list_match(matchup)
+    else:
+        result = between = _compare(a, b, options)
+        chains = iter(())
     if output is not None:
         write_text(output, format_csv(HEAD, list_rows(result.to_json())), overwrite=options["overwrite"])
-    chains = _list_match(result) if strip else ()
     parts = [*_list_parts(between), *chains]
     answer(result.to_json(), Sheet("compare", parts), "chains" if strip else "")
     fewer = min(between.echoes_a, between.echoes_b)
@@ -136,24 +154,6 @@ def _compare(a: Path, b: Path | None, options: dict) -> Comparison:
     how = {} if options["within"] is None else {"tolerance_ns": options["within"]}
     how["chosen"] = PointFilter(where=options["where"])
     return compare_truth(a, truth, **how) if truth else compare_clouds(a, b, **how)
-
-
-def _match(a: Path, b: Path | None, strip: Path, options: dict) -> Matchup:
-    from wavebatch.core.errors import nearest
-    from wavebatch.surveying.choose_chain import COSTS
-    from wavebatch.surveying.system_file import load_survey
-    from wavebatch.tools.api import AUTO
-    from wavebatch.tools.compare_chains import find_contender, match_sides
-
-    saved = None if options["system"] is None else load_survey(options["system"])
-    sides = [None if side is None else find_contender(str(side)) for side in (a, b)]
-    for side in sides:
-        if side is not None and side.is_cloud and not Path(side.name).exists():
-            chain = nearest(side.name, [AUTO, *COSTS])
-            raise click.UsageError(f"{side.name}: is neither a file nor a shipped chain; {chain}")
-    more = {"survey": saved and saved.survey, "force": options["force"], "limit": options["limit"]}
-    more |= {} if options["within"] is None else {"tolerance_ns": options["within"]}
-    return match_sides(strip, *sides, **more)
 
 
 _UNITS = {"time": "time ns", "echo_time": "echo_time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}

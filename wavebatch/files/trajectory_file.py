@@ -84,7 +84,18 @@ def read_trajectory(
             for name in ("latitude", "longitude"):
                 columns[name] = np.degrees(columns[name])
     else:
-        columns = _read_text(path, size)
+        if size > MOST_TEXT:
+            raise InputError(f"{path}: {size / 1e9:.1f} GB of text are too much; thin it to 20 positions per second")
+        lines = path.read_text("utf-8", "replace").splitlines()
+        place, found = _find_names(path, lines)
+        listed = [name if name not in found[:i] else "" for i, name in enumerate(found)]
+        body = (_split(line) for line in lines[place + 1 :])
+        rows = [row for row in (_numbers(fields, len(listed)) for fields in body) if row is not None]
+        if not rows:
+            raise InputError(f"{path}: no line of numbers follows the header in line {place + 1}")
+        table = np.array(rows)
+        columns = {name: table[:, i] for i, name in enumerate(listed) if name}
+        columns = {name: np.radians(values) if name in _ATTITUDE else values for name, values in columns.items()}
     if "x" in columns:
         xyz = np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
     elif crs is None:
@@ -141,21 +152,6 @@ def _find_names(path: Path, lines: list[str]) -> tuple[int, list[str]]:
         f"{path}: no line names the columns of the trajectory; the first line must hold time, x, y, z "
         "(or time, latitude, longitude, height)"
     )
-
-
-def _read_text(path: Path, size: int) -> dict[str, np.ndarray]:
-    if size > MOST_TEXT:
-        raise InputError(f"{path}: {size / 1e9:.1f} GB of text are too much; thin it to 20 positions per second")
-    lines = path.read_text("utf-8", "replace").splitlines()
-    place, found = _find_names(path, lines)
-    names = [name if name not in found[:i] else "" for i, name in enumerate(found)]
-    body = (_split(line) for line in lines[place + 1 :])
-    rows = [row for row in (_numbers(fields, len(names)) for fields in body) if row is not None]
-    if not rows:
-        raise InputError(f"{path}: no line of numbers follows the header in line {place + 1}")
-    table = np.array(rows)
-    columns = {name: table[:, i] for i, name in enumerate(names) if name}
-    return {name: np.radians(values) if name in _ATTITUDE else values for name, values in columns.items()}
 
 
 def _split(line: str) -> list[str]:

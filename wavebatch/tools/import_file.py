@@ -304,8 +304,14 @@ def make_plan(reader: PulseReader) -> Plan:
     primary = channels.most_common(1)[0][0]
     overlap = overlaps.get(primary, Overlaps())
     others = tuple(channel for channel in channels if channel != primary)
-    ratio = overlap.find_ratio() if len(others) == 1 else None  # overlaps show that of sensors with two channels
-    ratios, unknown = ({}, others) if ratio is None or ratio <= 1 else ({others[0]: ratio}, ())
+    # Gain of the sensitive channel over that of the other: overlaps show that of sensors with two channels.
+    ratio = 0.0
+    if len(others) == 1 and overlap.products:
+        x, y = (np.concatenate(values) for values in zip(*overlap.products, strict=True))
+        used = (x > LINEAR[0] * overlap.top) & (x < LINEAR[1] * overlap.top) & (y > 0)
+        if np.count_nonzero(used) >= LEAST_SAMPLES:
+            ratio = float((x[used] * y[used]).sum() / (y[used] ** 2).sum())
+    ratios, unknown = ({}, others) if ratio <= 1 else ({others[0]: ratio}, ())
     noise = max(float(np.median(np.concatenate(steps))) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
     latest = max(abs(time * header.time_scale + header.time_offset) for time in (first, last))
     week = latest <= 2 * WEEK  # flights over the end of a week count on
@@ -615,16 +621,6 @@ class Overlaps:
             other = np.where(inside, found, np.nan)
             inside = np.isfinite(other)
             self.products.append((x[inside], other[inside]))
-
-    def find_ratio(self) -> float | None:
-        """Gain of the sensitive channel over that of the other; None where it is not known."""
-        if not self.products:
-            return None
-        x, y = (np.concatenate(values) for values in zip(*self.products, strict=True))
-        used = (x > LINEAR[0] * self.top) & (x < LINEAR[1] * self.top) & (y > 0)
-        if np.count_nonzero(used) < LEAST_SAMPLES:
-            return None
-        return float((x[used] * y[used]).sum() / (y[used] ** 2).sum())
 
 
 # Coordinates

@@ -267,6 +267,7 @@ class Pairing:
         """Adds whole pulses: echoes of equal gps_time belong to one pulse.
 
         packets: gps_time of each pulse that counts, with or without echoes; if empty, all pulses with an echo count.
+        Raises InputError if too many echoes of one pulse lie within reach of each other.
         """
         times = np.concatenate([a["gps_time"], b["gps_time"], packets["gps_time"]])
         known, group = np.unique(times, return_inverse=True)
@@ -281,7 +282,32 @@ class Pairing:
             new = np.bincount(number[counted], minlength=len(self.counts[side]))
             new[: len(self.counts[side])] += self.counts[side]
             self.counts[side] = new
-        left, right = pair_echoes(in_a, a["xyz"], in_b, b["xyz"], self.tolerance)
+        # The same echo: of one pulse and at most `tolerance` apart, one to one, nearest first.
+        xyz_a, xyz_b = a["xyz"], b["xyz"]
+        crowd = np.maximum(number_a, number_b) > MOST_PER_PULSE
+        calm_a, calm_b = (np.flatnonzero(~crowd[pulse]) for pulse in (in_a, in_b))
+        # The difference in height is never larger than the distance: a fast first choice of pairs.
+        left, right = list_pairs(in_a[calm_a], xyz_a[calm_a, 2], in_b[calm_b], xyz_b[calm_b, 2], self.tolerance)
+        left, right = calm_a[left], calm_b[right]
+        if crowd.any():
+            # Among points with one GPS time, heights would leave too many pairs to check.
+            rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (in_a, in_b))
+            if len(rows_a) and len(rows_b):
+                trees = scipy.spatial.cKDTree(xyz_a[rows_a]), scipy.spatial.cKDTree(xyz_b[rows_b])
+                if trees[0].count_neighbors(trees[1], self.tolerance) > MOST_PAIRS:
+                    raise InputError(
+                        f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} "
+                        "others and lie too close together to be paired; remove the points without a valid GPS time"
+                    )
+                near = trees[0].sparse_distance_matrix(trees[1], self.tolerance, output_type="ndarray")
+                near_a, near_b = rows_a[near["i"]], rows_b[near["j"]]
+                same = in_a[near_a] == in_b[near_b]
+                left, right = np.append(left, near_a[same]), np.append(right, near_b[same])
+        distance = np.linalg.norm(xyz_a[left] - xyz_b[right], axis=1)
+        near = np.flatnonzero(distance <= self.tolerance)
+        left, right = left[near], right[near]
+        kept = pair_nearest(left, right, distance[near], len(xyz_a), len(xyz_b))
+        left, right = left[kept], right[kept]
         self.differences.add(a[left], b[right])
         self._count(0, a, left, number_b[in_a])
         self._count(1, b, right, number_a[in_b])
@@ -354,42 +380,6 @@ class Pairing:
 
 def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
-
-
-def pair_echoes(
-    pulse_a: np.ndarray, xyz_a: np.ndarray, pulse_b: np.ndarray, xyz_b: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of a and b that are the same echo: of one pulse and at most `reach` [m] apart, one to one, nearest first.
-
-    pulse_a, pulse_b: numbers of the pulses, from 0, (k,); xyz_a, xyz_b: positions f8 (k, 3) [m]. Raises InputError if
-    too many echoes of one pulse lie within reach of each other.
-    """
-    number = max(pulse_a.max(initial=0), pulse_b.max(initial=0)) + 1
-    most = np.maximum(*(np.bincount(pulse, minlength=number) for pulse in (pulse_a, pulse_b)))
-    crowd = most > MOST_PER_PULSE
-    calm_a, calm_b = (np.flatnonzero(~crowd[pulse]) for pulse in (pulse_a, pulse_b))
-    # The difference in height is never larger than the distance: a fast first choice of pairs.
-    left, right = list_pairs(pulse_a[calm_a], xyz_a[calm_a, 2], pulse_b[calm_b], xyz_b[calm_b, 2], reach)
-    left, right = calm_a[left], calm_b[right]
-    if crowd.any():
-        # Among points with one GPS time, heights would leave too many pairs to check.
-        rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (pulse_a, pulse_b))
-        if len(rows_a) and len(rows_b):
-            trees = scipy.spatial.cKDTree(xyz_a[rows_a]), scipy.spatial.cKDTree(xyz_b[rows_b])
-            if trees[0].count_neighbors(trees[1], reach) > MOST_PAIRS:
-                raise InputError(
-                    f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} "
-                    "others and lie too close together to be paired; remove the points without a valid GPS time"
-                )
-            near = trees[0].sparse_distance_matrix(trees[1], reach, output_type="ndarray")
-            near_a, near_b = rows_a[near["i"]], rows_b[near["j"]]
-            same = pulse_a[near_a] == pulse_b[near_b]
-            left, right = np.append(left, near_a[same]), np.append(right, near_b[same])
-    distance = np.linalg.norm(xyz_a[left] - xyz_b[right], axis=1)
-    near = np.flatnonzero(distance <= reach)
-    left, right = left[near], right[near]
-    kept = pair_nearest(left, right, distance[near], len(xyz_a), len(xyz_b))
-    return left[kept], right[kept]
 
 
 # Differences of pairs

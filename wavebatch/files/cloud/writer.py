@@ -365,8 +365,23 @@ class CloudWriter(PointFile):
         self._layout = layout
         packets = layout.packets
         self._inputs = [layout.source.path, *([packets.file] if packets else [])]
-        self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
         source = layout.source.header
+        found, missing = las.find_evlrs(layout.source.path, source)
+        self._evlrs: list[las.Evlr] = []
+        self.dropped: dict[str, str] = {}
+        for evlr in found:
+            name = f"EVLR {evlr.user} {evlr.record_id}"
+            is_waveforms = evlr.user.startswith("LAS") and evlr.record_id == las.WAVEFORM_RECORD_ID
+            if is_waveforms or evlr.start == source.waveform_start:
+                continue
+            if evlr.user == "copc":
+                self.dropped[name] = "the output is not a COPC file"
+            elif las.has_record([evlr], "LASF_Spec", las.EXTRA_BYTES_RECORD_ID):
+                self.dropped[name] = "extra bytes are described in the header"
+            else:
+                self._evlrs.append(evlr)
+        if missing:
+            self.dropped[f"{missing} EVLRs"] = f"they lie outside the file, or after the first {las.MAX_EVLRS}"
         vlrs = []
         for vlr in source.vlrs:
             descriptor = vlr.user.startswith("LAS") and vlr.user.endswith("_Spec") and vlr.record_id in _DESCRIPTORS
@@ -434,27 +449,6 @@ class CloudWriter(PointFile):
             self.drafts.insert(0, draft)
             draft.file.write(head)
             copy_bytes(source, packets.start, packets.end, draft.file)
-
-
-def _choose_evlrs(path: Path, header: las.LasHeader) -> tuple[list[las.Evlr], dict[str, str]]:
-    """Extended records to copy, and the names of the others with the reason."""
-    found, missing = las.find_evlrs(path, header)
-    kept: list[las.Evlr] = []
-    dropped: dict[str, str] = {}
-    for evlr in found:
-        name = f"EVLR {evlr.user} {evlr.record_id}"
-        is_waveforms = evlr.user.startswith("LAS") and evlr.record_id == las.WAVEFORM_RECORD_ID
-        if is_waveforms or evlr.start == header.waveform_start:
-            continue
-        if evlr.user == "copc":
-            dropped[name] = "the output is not a COPC file"
-        elif las.has_record([evlr], "LASF_Spec", las.EXTRA_BYTES_RECORD_ID):
-            dropped[name] = "extra bytes are described in the header"
-        else:
-            kept.append(evlr)
-    if missing:
-        dropped[f"{missing} EVLRs"] = f"they lie outside the file, or after the first {las.MAX_EVLRS}"
-    return kept, dropped
 
 
 def _as_text(field: bytes) -> bytes:

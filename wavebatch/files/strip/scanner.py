@@ -14,7 +14,7 @@ through a sort on disk. Both searches must find the same groups; the tests compa
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field
 
 import numpy as np
@@ -189,47 +189,6 @@ class NearSharing:
     def suspects(self) -> np.ndarray:
         """Return for each bin whether its points lie too far apart for the window."""
         return (self._last - self._first) >= self._window
-
-
-def find_far(
-    units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders: np.ndarray, sizes: ScanSizes
-) -> tuple[Spool, int, int, np.ndarray]:
-    """Far search among all keys of `units`, as (keys, file index), `count` in all, in bounded memory.
-
-    Returns for each unit which of its points which other unit needs, the number of packets, how far apart points of a
-    packet lie, and the keys of overfull packets.
-    """
-    buckets = count // sizes.keys + 1
-    spool = Spool(buckets, _KEY, memory=sizes.spooled)
-    wants = Spool(len(borders) - 1, _WANT, memory=sizes.spooled)
-    packets, reach, overfull = 0, 0, []
-    with spool, undoing(wants.close):
-        for keys, index in units:
-            entries = np.empty(len(keys), _KEY)
-            entries["key"], entries["index"] = keys, index
-            spool.append(spread_keys(keys, buckets), entries)
-        spool.seal()
-        for bucket in range(buckets):
-            # In file order; of overfull packets only the first entries, enough to know them.
-            entries = np.empty(0, _KEY)
-            for part in spool.pieces(bucket):
-                entries = np.concatenate([entries, part])
-                groups = group_keys(entries["key"])
-                if (groups.counts > MAX_RETURNS + 1).any():
-                    keep = groups.order[expand(groups.starts, np.minimum(groups.counts, MAX_RETURNS + 1))]
-                    entries = entries[np.sort(keep)]
-            groups = group_keys(entries["key"])
-            packets += len(groups.starts)
-            if len(entries):
-                lead, tail = groups.order[groups.starts], groups.order[groups.starts + groups.counts - 1]
-                reach = max(reach, int((entries["index"][tail] - entries["index"][lead]).max()))
-                overfull.append(entries["key"][lead[groups.counts > MAX_RETURNS]])
-            unit = np.searchsorted(borders, entries["index"], "right") - 1
-            target, member = cross_units(groups, unit)
-            asked = np.empty(len(target), _WANT)
-            asked["index"], asked["unit"] = entries["index"][member], target
-            wants.append(unit[member], asked)
-    return wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull])
 
 
 @frozen(eq=False)
@@ -574,34 +533,65 @@ class Scanner:
         self._found.votes.add_pairs(xyz, first, second)
 
     def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
-        """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context."""
+        """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context.
+
+        In bounded memory. Returns the number of packets, how far apart points of a packet lie, and the keys of overfull
+        packets.
+        """
         borders = np.array(self._found.borders)
         count = int(self._found.tally.reasons[check.Reason.USABLE])
-        far, packets, reach, overfull = find_far(self._suspect_keys(suspects), count, borders, self._sizes)
+        buckets = count // self._sizes.keys + 1
+        spool = Spool(buckets, _KEY, memory=self._sizes.spooled)
+        # For each unit, which of its points which other unit needs.
+        wants = Spool(len(borders) - 1, _WANT, memory=self._sizes.spooled)
+        packets, reach, overfull = 0, 0, []
+        with spool, undoing(wants.close):
+            for start, judged in self._judge_again():
+                rows = np.flatnonzero(judged.usable)
+                rows = rows[suspects[self._found.near.bin(judged.keys[rows])]]
+                entries = np.empty(len(rows), _KEY)
+                entries["key"], entries["index"] = judged.keys[rows], start + rows
+                spool.append(spread_keys(entries["key"], buckets), entries)
+            spool.seal()
+            for bucket in range(buckets):
+                # In file order; of overfull packets only the first entries, enough to know them.
+                entries = np.empty(0, _KEY)
+                for part in spool.pieces(bucket):
+                    entries = np.concatenate([entries, part])
+                    groups = group_keys(entries["key"])
+                    if (groups.counts > MAX_RETURNS + 1).any():
+                        keep = groups.order[expand(groups.starts, np.minimum(groups.counts, MAX_RETURNS + 1))]
+                        entries = entries[np.sort(keep)]
+                groups = group_keys(entries["key"])
+                packets += len(groups.starts)
+                if len(entries):
+                    lead, tail = groups.order[groups.starts], groups.order[groups.starts + groups.counts - 1]
+                    reach = max(reach, int((entries["index"][tail] - entries["index"][lead]).max()))
+                    overfull.append(entries["key"][lead[groups.counts > MAX_RETURNS]])
+                home = np.searchsorted(borders, entries["index"], "right") - 1
+                target, member = cross_units(groups, home)
+                asked = np.empty(len(target), _WANT)
+                asked["index"], asked["unit"] = entries["index"][member], target
+                wants.append(home[member], asked)
+        far = wants.seal()
         try:
             for unit in range(len(borders) - 1):
-                wants = far.read(unit)
-                if len(wants):
+                needed = far.read(unit)
+                if len(needed):
                     start, context = int(borders[unit]), self._found.context
                     points = self._source.read(start, int(borders[unit + 1]))
-                    entries = np.empty(len(wants), context.dtype)
-                    entries["index"] = wants["index"]
-                    entries["record"] = take_whole_records(points, wants["index"] - start)
-                    context.append(wants["unit"], entries)
+                    records = np.empty(len(needed), context.dtype)
+                    records["index"] = needed["index"]
+                    records["record"] = take_whole_records(points, needed["index"] - start)
+                    context.append(needed["unit"], records)
         finally:
             far.close()
-        return packets, reach, overfull
+        return packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull])
 
     def _judge_again(self, overfull: np.ndarray | None = None) -> Iterator[tuple[int, check.Judged]]:
         """First index and check of each unit, for passes after the first one."""
         for start, stop in itertools.pairwise(self._found.borders):
             yield start, self._judge.judge(self._source.read(start, stop), self._form, overfull)
-
-    def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for start, judged in self._judge_again():
-            rows = np.flatnonzero(judged.usable)
-            rows = rows[suspects[self._found.near.bin(judged.keys[rows])]]
-            yield judged.keys[rows], start + rows
 
 
 @frozen(eq=False)

@@ -125,7 +125,16 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
         # The median distance from a plane fitted to few points is too small (Rousseeuw and Leroy 1987).
         few = 1.0 + 5.0 / np.maximum(count[active] - 3, 1)
         factor = np.where(tight, TIGHT, OUTLYING * MAD_TO_STD * few)
-        limit[active] = factor * np.maximum(_medians(off, local, count[active]), LEAST_SPREAD)
+        # Upper medians: rows of a table, filled up with as many values below all others as above, so that the middle is
+        # in one place for all.
+        number_of = count[active]
+        width = int(number_of.max())
+        start = np.cumsum(number_of) - number_of
+        below = width // 2 - number_of // 2
+        table = np.full((len(number_of), width), np.inf)
+        table[np.arange(width) < below[:, None]] = -np.inf
+        table[local, np.arange(len(off)) - start[local] + below[local]] = off
+        limit[active] = factor * np.maximum(np.partition(table, width // 2, axis=1)[:, width // 2], LEAST_SPREAD)
         near = off <= limit[at]
         changed = np.bincount(local, near != kept[rows], minlength=len(active)) > 0
         kept[rows] = near
@@ -199,20 +208,6 @@ def _solve(moments: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarra
         covariance[:, a, b] = covariance[:, b, a] = total / number - centre[:, a] * centre[:, b]
     spreads, axes = np.linalg.eigh(covariance)
     return centre, spreads, axes
-
-
-def _medians(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Upper median of each set; every set has a value.
-
-    Rows of a table, filled up with as many values below all others as above: the middle is in one place for all.
-    """
-    width = int(count.max())
-    start = np.cumsum(count) - count
-    below = width // 2 - count // 2
-    table = np.full((len(count), width), np.inf)
-    table[np.arange(width) < below[:, None]] = -np.inf
-    table[group, np.arange(len(values)) - start[group] + below[group]] = values
-    return np.partition(table, width // 2, axis=1)[:, width // 2]
 
 
 DIRECTIONS = 24
@@ -485,7 +480,15 @@ def fit_facet(xyz: np.ndarray, unit: np.ndarray) -> Facet:
     scatter = float(np.sqrt(max(np.mean((along - rest - across @ slope)[kept] ** 2), LEAST_SCATTER**2)))
     normal = frame.T @ np.array([-slope[0], -slope[1], 1.0])
     normal /= np.sqrt(normal @ normal)
-    return Facet(normal, kept, scatter, *_angle_errors(slope, variance))
+    # Standard deviation of the angle [rad], and of its cosine, relative. Far from the normal only the slope towards the
+    # ray counts, at the normal both count alike.
+    steep, total = float(slope @ slope), float(np.trace(variance))
+    weight = np.outer(slope, slope) + 0.5 * min(total, 1.0) * np.eye(2)
+    towards = float(np.sum(weight * variance) / np.trace(weight))
+    error = float(np.sqrt(towards) / (1.0 + steep))
+    if error > 1.0:
+        return Facet(normal, kept, scatter, np.inf, np.inf)
+    return Facet(normal, kept, scatter, error, float(np.sqrt(steep) * error + 0.5 * total / (1.0 + steep) ** 2))
 
 
 def _start(across: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -517,16 +520,3 @@ def _regress(across: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, float, 
     variance = noise / (len(off) * spread) + LINE_ERROR**2 / (4.0 * spread)
     slope = axes @ local
     return slope, mean - float(centre @ slope), axes @ np.diag(variance) @ axes.T
-
-
-def _angle_errors(slope: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
-    """Standard deviation of the angle [rad], and of its cosine, relative."""
-    steep = float(slope @ slope)
-    total = float(np.trace(variance))
-    # Far from the normal only the slope towards the ray counts, at the normal both count alike.
-    weight = np.outer(slope, slope) + 0.5 * min(total, 1.0) * np.eye(2)
-    towards = float(np.sum(weight * variance) / np.trace(weight))
-    error = np.sqrt(towards) / (1.0 + steep)
-    if error > 1.0:
-        return np.inf, np.inf
-    return float(error), float(np.sqrt(steep) * error + 0.5 * total / (1.0 + steep) ** 2)

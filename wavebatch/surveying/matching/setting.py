@@ -278,7 +278,7 @@ def measure_setting(
     for channel, rows in known.items():
         time, light, east, north = rows[:4]
         brightest[channel] = float(np.quantile(light, BRIGHT))
-        scenes[channel] = _describe_scene(light)
+        scenes[channel] = tuple(np.log(np.quantile(light, QUANTILES)).tolist())
         off = time - 0.5 * (time.min() + time.max())
         places[channel] = np.stack([east, north, np.log(light), off / max(float(off.max()), 1e-9)])
         fading.append(_find_fading(time, light, rows[2:4], chance=chance))
@@ -389,10 +389,6 @@ def keep_places(places: Mapping[_Channel, np.ndarray]) -> tuple[float, ...]:
     return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
 
 
-def _describe_scene(light: np.ndarray) -> tuple[float, ...]:
-    return tuple(np.log(np.quantile(light, QUANTILES)).tolist())
-
-
 def _find_fading(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chance: float) -> Change:
     """How light grows from the first half of a strip to the second; place: east and north, f8 (2, n).
 
@@ -406,7 +402,7 @@ def _find_fading(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chan
     middle = np.array([time[part].mean() for part in parts])
     middle -= middle.mean()
     half = 2.0 * np.abs(middle).mean()
-    scenes = np.array([_describe_scene(light[part]) for part in parts])
+    scenes = np.array([np.log(np.quantile(light[part], QUANTILES)) for part in parts])
     slopes, levels = half * (middle @ scenes) / (middle @ middle), np.median(scenes, axis=1)
     rest = levels - levels.mean() - middle * (middle @ levels) / (middle @ middle)
     error = weigh_alike(rest) * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) / (middle @ middle)))

@@ -124,15 +124,14 @@ def measure_strip(report: Mapping[str, Any]) -> dict[str, float]:
     amplitude, width = (report["quality"][name]["p50"] for name in ("amplitude_dn", "echo_width_ns"))
     passed = sum(counts["passed_through"].values())
     rows = counts["points_out"] + sum(counts["left_out"].values())
-
-    def percent(number: float, whole: float) -> float:
-        return 100 * number / whole if whole else math.nan
-
+    parts = {
+        "passed": (passed, rows),
+        "added": (counts["added_echoes"], counts["echoes"]),
+        "weak": (counts["flags"]["WEAK"], counts["points_out"]),
+    }
     return {
         "echoes": counts["echoes"] / counts["waveforms"] if counts["waveforms"] else math.nan,
-        "passed": percent(passed, rows),
-        "added": percent(counts["added_echoes"], counts["echoes"]),
-        "weak": percent(counts["flags"]["WEAK"], counts["points_out"]),
+        **{name: 100 * number / whole if whole else math.nan for name, (number, whole) in parts.items()},
         "amplitude": math.nan if amplitude is None else amplitude,
         "width": math.nan if width is None else width,
         "pulse": FWHM_PER_SIGMA * system["sigma_ref_ns"],
