@@ -211,8 +211,12 @@ def measure_profile(
     """
     clouds, crs = open_heights(paths, column, chosen)
     cells.check_statistic(column, statistic, clouds.facts, paths[0])
-    heights_of = lambda _, rows: rows["values"][np.isfinite(rows["values"][:, 1]), 1:]  # noqa: E731
-    total, sample, box = cells.sample_points(clouds, heights_of)
+
+    def pick(_: int, rows: np.ndarray) -> np.ndarray:
+        height = rows["values"][:, 1:].reshape(-1, 1)
+        return height[np.isfinite(height[:, 0])]
+
+    total, sample, box = cells.sample_points(clouds, pick)
     if not sample.seen:
         raise clouds.complain(total)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
