@@ -106,41 +106,6 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
         context.default_map = {name: value for values in found.values() for name, value in values.items()}
 
 
-def settle_options(context: click.Context) -> None:
-    """Put settings aside that exclude an option that counts more: of the command line, or of a variable.
-
-    Then print the settings in force in one line, keep them for --dry-run, and name variables without use. With --quiet
-    those of a file are printed still: who types the command may not know of the file.
-    """
-    options = _list_options(context.command)
-    for rivals in EXCLUSIVE:
-        given = {name: _ORDER.index(source) for name in rivals
-                 if name in options and (source := context.get_parameter_source(name)) in _ORDER}  # fmt: skip
-        for name in [name for name, place in given.items() if place > min(given.values())]:
-            (context.default_map or {}).pop(name, None)
-            default = options[name].get_default(context)
-            context.params[name] = default if isinstance(default, bool | int | str) else None
-            context.set_parameter_source(name, ParameterSource.DEFAULT)
-    lines, shown = [], []
-    for name, option in options.items():
-        source = context.get_parameter_source(name)
-        if source is ParameterSource.DEFAULT_MAP:
-            place, value = next((str(path), values[name]) for path, values in context.meta[READ].items()
-                                if name in values)  # fmt: skip
-        elif source is ParameterSource.ENVIRONMENT:
-            place = next(variable for variable in option.envvar if os.environ.get(variable))
-            value = os.environ[place]
-        else:
-            continue
-        lines.append(f"--{_option_name(option)} {value} ({place})")
-        shown += lines[-1:] if source is ParameterSource.DEFAULT_MAP or not context.params.get("quiet") else []
-    context.meta["wavebatch.settings"] = tuple(lines)
-    for line in _find_strangers(context):
-        talk(f"warning: {line}")
-    if shown:
-        talk(f"settings: {', '.join(shown)}")
-
-
 def _find_strangers(context: click.Context) -> Iterator[str]:
     """What is wrong with variables of our name that no command reads."""
     given = [name for name in os.environ if name.startswith(PREFIX)]
@@ -359,7 +324,36 @@ class ProgramCommand(click.Command):
                 if isinstance(number, float) and not math.isfinite(number) and option.name not in MAYBE_NAN:
                     raise click.BadParameter(f"{number} is not a finite number.", ctx, option)
         if is_real:
-            settle_options(ctx)
+            # Settings are put aside that exclude an option that counts more: of the command line, or of a variable.
+            # Then those in force are printed in one line, kept for --dry-run, and variables without use named. With
+            # --quiet those of a file are printed still: who types the command may not know of the file.
+            options = _list_options(ctx.command)
+            for rivals in EXCLUSIVE:
+                given = {name: _ORDER.index(source) for name in rivals
+                         if name in options and (source := ctx.get_parameter_source(name)) in _ORDER}  # fmt: skip
+                for name in [name for name, place in given.items() if place > min(given.values())]:
+                    (ctx.default_map or {}).pop(name, None)
+                    default = options[name].get_default(ctx)
+                    ctx.params[name] = default if isinstance(default, bool | int | str) else None
+                    ctx.set_parameter_source(name, ParameterSource.DEFAULT)
+            lines, shown = [], []
+            for name, option in options.items():
+                source = ctx.get_parameter_source(name)
+                if source is ParameterSource.DEFAULT_MAP:
+                    place, value = next((str(path), values[name]) for path, values in ctx.meta[READ].items()
+                                        if name in values)  # fmt: skip
+                elif source is ParameterSource.ENVIRONMENT:
+                    place = next(variable for variable in option.envvar if os.environ.get(variable))
+                    value = os.environ[place]
+                else:
+                    continue
+                lines.append(f"--{_option_name(option)} {value} ({place})")
+                shown += lines[-1:] if source is ParameterSource.DEFAULT_MAP or not ctx.params.get("quiet") else []
+            ctx.meta["wavebatch.settings"] = tuple(lines)
+            for line in _find_strangers(ctx):
+                talk(f"warning: {line}")
+            if shown:
+                talk(f"settings: {', '.join(shown)}")
         return rest
 
     def _rename(self, word: str) -> str:

@@ -414,7 +414,16 @@ class Differences:
     def add(self, a: np.ndarray, b: np.ndarray) -> None:
         """Adds pairs: a[i] with b[i]."""
         part = {name: a[name].astype(np.float64) - b[name] for name in _BOTH}
-        part["time"] = measure_lag(a, b) / AIR_SPEED
+        # Distance of a after b along the ray [m], positive away from the sensor. The ray is the packet vector of b, or
+        # of a; without both, the lower point counts as the farther one.
+        step = a["xyz"] - b["xyz"]
+        ray = np.where(np.any(b["ray"] != 0, axis=1)[:, None], b["ray"], a["ray"]).astype(np.float64)
+        length = np.linalg.norm(ray, axis=1)
+        known = length > 0
+        down = -np.sign(ray[:, 2]) / np.where(known, length, 1.0)
+        along = np.einsum("ij,ij->i", step, ray) * down
+        by_height = np.linalg.norm(step, axis=1) * -np.sign(step[:, 2])
+        part["time"] = np.where(known & (down != 0), along, by_height) / AIR_SPEED
         for name, values in part.items():
             good = values[~np.isnan(values)]
             self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
@@ -494,21 +503,6 @@ def _spread(sums: np.ndarray, values: np.ndarray) -> ErrorSpread:
     median = np.median(values) if len(values) else np.nan
     nmad = MAD_TO_STD * np.median(np.abs(values - median)) if len(values) else np.nan
     return ErrorSpread(int(number), float(median), total / number, float(np.sqrt(squares / number)), float(nmad))
-
-
-def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distance of a after b along the ray [m], f8 (k,), positive away from the sensor.
-
-    The ray is the packet vector of b, or of a; without both, the lower point counts as the farther one.
-    """
-    step = a["xyz"] - b["xyz"]
-    ray = np.where(np.any(b["ray"] != 0, axis=1)[:, None], b["ray"], a["ray"]).astype(np.float64)
-    length = np.linalg.norm(ray, axis=1)
-    known = length > 0
-    down = -np.sign(ray[:, 2]) / np.where(known, length, 1.0)
-    along = np.einsum("ij,ij->i", step, ray) * down
-    by_height = np.linalg.norm(step, axis=1) * -np.sign(step[:, 2])
-    return np.where(known & (down != 0), along, by_height)
 
 
 # Echoes without a partner, by possible reasons

@@ -367,7 +367,9 @@ def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, k
         starts = np.concatenate([[True], apart | (np.diff(echoes.waveform) != 0)])
         order = np.lexsort((-echoes.amplitude, np.cumsum(starts) - 1))
         echoes = echoes.take(order[np.flatnonzero(starts)])
-    echoes = echoes.take(np.flatnonzero(_count_within(echoes.waveform) < most))
+    # Waveforms ascend: the place of an echo less that of the first one of its waveform is its number.
+    number = np.arange(len(echoes)) - np.searchsorted(echoes.waveform, echoes.waveform)
+    echoes = echoes.take(np.flatnonzero(number < most))
     pulse, time, amplitude = echoes.waveform.astype(np.int64), echoes.time, echoes.amplitude
     if keep_empty:
         empty = np.flatnonzero(np.bincount(pulse, minlength=n) == 0)
@@ -377,7 +379,8 @@ def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, k
         time = np.append(time, np.full(len(empty), recording.duration / 2))[order]
         amplitude = np.append(amplitude, np.zeros(len(empty), np.float32))[order]
     total = np.bincount(pulse, minlength=n)[pulse]
-    return Returns(pulse, time, amplitude, _count_within(pulse) + 1, total)
+    number = 1 + np.arange(len(pulse)) - np.searchsorted(pulse, pulse)
+    return Returns(pulse, time, amplitude, number, total)
 
 
 def fill_packets(
@@ -395,11 +398,6 @@ def fill_packets(
     points["return_point_wave_location"] = np.where(has, time * PS_PER_NS, 0)
     for axis, name in enumerate(("x_t", "y_t", "z_t")):
         points[name] = np.where(has, -step[:, axis] / PS_PER_NS, 0)
-
-
-def _count_within(group: np.ndarray) -> np.ndarray:
-    """Position of every row within its run of equal values, from 0; group: sorted."""
-    return np.arange(len(group)) - np.searchsorted(group, group)
 
 
 MARGIN = 6.0
