@@ -21,7 +21,7 @@ INSIDE = {
     ],
     "surveying/measuring": [
         {"noise_and_width"}, {"residuals"},
-        {"misfit", "learn_pulse", "judge", "whitening", "return_scatter"}, {"joint_pulse", "mirror"}, {"choose_pulse"},
+        {"misfit", "learn_pulse", "judge", "return_scatter"}, {"joint_pulse", "mirror"}, {"choose_pulse", "whitening"},
     ],
     "batch/workers": [
         {"futures", "serve", "worker_check"}, {"spawned"}, {"processes"}, {"dask_cluster"},

@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
-from wavebatch.stages.pulse_tables import noise_factors, pulse_shape
+from wavebatch.stages.pulse_tables import noise_factors, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.judge import SURE, Explained, count_errors, describe_waveforms, exceed, explain
 from wavebatch.surveying.measuring.mirror import look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import DITHERED, FEW, UNDITHERED, find_single, thin_samples
@@ -81,7 +81,7 @@ def lower_noise(block: WaveformBlock, system: SystemPulse) -> ReceiverNoise:
 
 def _list_lower(system: SystemPulse, spacing: float) -> Iterator[ReceiverNoise]:
     """Less noise: without what two neighbours do not say of its correlation, as weak echoes make it, and by a step."""
-    noise, width = system.noise, system.sigma_ref / spacing
+    noise, width = system.noise, shape_limits(system, spacing).ref
     near, shares, tried = [1.0, *noise.correlation[:2]], predict_noise(noise.correlation), []
     if shares is not None and len(near) > 2:
         while len(near) <= len(noise.correlation):
