@@ -43,8 +43,9 @@ from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
 
-SAMPLED_UNITS = 8
-"""Units of a strip whose points are read to find planes."""
+SAMPLED_UNITS, OF_SAMPLE = 4, 2
+"""Units of a strip whose points are read to find planes, and part of a survey's waveforms that is looked at: already
+1,000 echoes of slopes tell a divergence to less than LEAST_DIVERGENCE_ERROR, and planes take most of the time."""
 
 LEAST_NEIGHBOURS = 8
 """Points of a plane, as by default in stage attribute.incidence_angle_normals."""
@@ -473,7 +474,8 @@ def sample_reference(
     -------
     Reference
     """
-    return measure_reference(sample_slopes(reader, scan, source, sample_size(reader, scan)), system, spacing)
+    samples = sample_slopes(reader, scan, source, sample_size(reader, scan) // OF_SAMPLE)
+    return measure_reference(samples, system, spacing)
 
 
 def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergence: float | None) -> Survey:

@@ -200,7 +200,7 @@ def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
     best = min(found, key=lambda one: one.difference, default=None)
     if best is None or best.difference >= ALIKE:
         return None
-    widths = best.known.system.sigma_ref * np.linspace(0.7, 1.5, 41)
+    widths = best.known.system.sigma_ref * np.linspace(0.7, 1.5, 21)
     nearest = min(compare_pulses(best.known.system, SystemPulse(sigma_ref=float(width))) for width in widths)
     limit = min(ALIKE, NOT_A_GAUSSIAN * nearest)
     return best if best.difference < limit else None
