@@ -97,8 +97,12 @@ def test_the_pulse_that_is_taken_and_why(sent, ratio, learned, same, taken, reas
 def test_pulses_of_various_widths_are_in_the_errors_of_normalized_amplitudes(sent):
     """Of one energy, a wider pulse is lower: 5 % of it left half of the amplitudes beyond their error."""
     strip, fwhm = sent(width_scatter=0.05)
-    found = compare_outgoing(_echoes(fwhm), strip).system
-    assert found.widths.scatter == pytest.approx(0.05 * found.sigma_ref)
+    two = _echoes(1.3 * fwhm)
+    two = replace(two, system=replace(two.system, digitizers={2: replace(two.system, sigma_ref=2.0)}))
+    found = compare_outgoing(two, strip).system
+    assert found.sigma_ref * FWHM_PER_SIGMA == pytest.approx(fwhm)  # the outgoing pulse is taken
+    for one in (found, found.digitizers[2]):
+        assert one.widths.scatter == pytest.approx(0.05 * one.sigma_ref)
     block = WaveformBlock.from_samples(np.zeros((1, 60), np.uint8), spacing=1.0)
     waveform, time, amplitude, width = np.zeros(1, int), np.full(1, 30.0), np.full(1, 50.0), np.full(1, found.sigma_ref)
     echoes = EchoTable.build(waveform, time, amplitude, width, amplitude_err=np.ones(1))
@@ -198,6 +202,8 @@ def test_pulses_whose_energy_is_clipped_have_an_error_by_their_light(tmp_path, r
         found = take_energies(reader, scan, None)
     off = np.abs(energies[np.isnan(sent)] / np.nanmean(sent) - 1)
     assert 0.45 < np.mean(off < found.energy.fills) < 0.95 and "count as of mean energy" in found.notes[0]
+    # --energy pulse_energy, which gives the others no data, must know half of them.
+    assert ("--energy pulse_energy gives them no values" in found.notes[0]) == (known > 0.5)
 
 
 @pytest.mark.slow

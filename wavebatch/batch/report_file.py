@@ -335,11 +335,13 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             f"points: the errors hold {sensor.turned:.1g} degrees of it; --trajectory would show it"
         )
     system = prepared.system
-    lacks = [name for name in ("hidden_light", "hidden_width") if system.hidden and not getattr(system, name)]
+    errors = {"hidden_light": "amplitudes and energies", "hidden_width": "widths"}
+    lacks = [name for name in errors if system.hidden and not getattr(system, name)]
     if lacks:
         lines.append(
-            f"--system: an earlier version made this file, without {' and '.join(lacks)}: errors of amplitudes, "
-            "energies and widths may be too small where echoes hide others; make it again with `wavebatch survey -o`"
+            f"--system: an earlier version made this file, without {' and '.join(lacks)}: errors of "
+            f"{', and of '.join(errors[name] for name in lacks)} may be too small where echoes hide others; "
+            "make it again with `wavebatch survey -o`"
         )
     # The pulse that a residual loop takes from the survey where the chain names none.
     step = prepared.job.chain.steps[2]

@@ -227,7 +227,11 @@ def compare_outgoing(found: Survey, strip: Path) -> Survey:
     figures = replace(found.figures, sent_fwhm_ns=theirs, sent_time_error_ns=sent.figures.outgoing_time_error_ns)
     shape = ("sigma_ref", "components", "kappa", "ringing")
     pulse = {name: getattr(sent.system, name) for name in shape} if take else {}
-    # Pulses of various widths scatter those of echoes, and their heights.
-    scatter = max(found.system.widths.scatter, found.system.sigma_ref * (sent.figures.outgoing_width_scatter or 0.0))
-    system = replace(found.system, widths=replace(found.system.widths, scatter=scatter), **pulse)
+    # Pulses of various widths scatter those of echoes, and their heights, whichever digitizer records them.
+    share, whole = sent.figures.outgoing_width_scatter or 0.0, replace(found.system, **pulse)
+    system, *others = (
+        replace(one, widths=replace(one.widths, scatter=max(one.widths.scatter, share * one.sigma_ref)))
+        for one in (whole, *whole.digitizers.values())
+    )
+    system = replace(system, digitizers=dict(zip(whole.digitizers, others, strict=True)))
     return replace(found, system=system, figures=figures, decisions=(*found.decisions, Decision(PART, take, text)))

@@ -15,7 +15,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
-from wavebatch.files.pulse_energy import COLUMN, LEAST_KNOWN, PulseEnergy, find_column, find_pulse_energy
+from wavebatch.files.pulse_energy import COLUMN, LEAST_KNOWN, LEAST_SHARE, PulseEnergy, find_column, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import CHANGE_CHANCE, Calibration
@@ -140,9 +140,10 @@ def take_energies(
         )
         said = [text for text, told in ((found, more > LEAST_SAID), (others, alone > LEAST_SAID)) if told]
         if said:
+            remedy = f"; --energy {energy.source} gives them no values" if energy.known >= LEAST_SHARE else ""
             notes.append(
                 f"{energy.source}: {1.0 - energy.known:.0%} of the pulses have none and count as of mean energy: "
-                f"{'; '.join(said)}; --energy {energy.source} gives them no values"
+                f"{'; '.join(said)}{remedy}"
             )
     # By how much the logarithm of the light of neighbouring pulses of one channel differs in turns; 0 where not.
     with np.errstate(invalid="ignore", divide="ignore"):

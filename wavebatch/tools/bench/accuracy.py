@@ -150,7 +150,7 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     """Cramer-Rao bounds of time [ns], amplitude [count] and sigma [ns] of every true echo, (m, 3).
 
     All echoes of a waveform are estimated together, the baseline is known; clipped samples have no weight, noise grows
-    with the signal. truth: as tools.simulate gives it; the bounds are those of the widths of `make_group`, infinite
+    with the signal. truth: as tools.simulate gives it; the bounds are those of the widths of `make_groups`, infinite
     where the samples do not determine them. Source: inverse Fisher matrix, derivatives of the painted pulse by central
     differences.
     """
@@ -236,7 +236,7 @@ class Group:
     number: int
     block: WaveformBlock
     truth: EchoTable
-    """In the terms of found echoes, see `describe_truth`."""
+    """In the terms of found echoes, see `make_groups`."""
     isolated: np.ndarray
     """Echoes without a close neighbour, bool (m,)."""
     bounds: np.ndarray
