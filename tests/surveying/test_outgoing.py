@@ -98,11 +98,14 @@ def test_pulses_of_various_widths_are_in_the_errors_of_normalized_amplitudes(sen
     """Of one energy, a wider pulse is lower: 5 % of it left half of the amplitudes beyond their error."""
     strip, fwhm = sent(width_scatter=0.05)
     two = _echoes(1.3 * fwhm)
-    two = replace(two, system=replace(two.system, digitizers={2: replace(two.system, sigma_ref=2.0)}))
+    two = replace(two, system=replace(two.system, digitizers={
+        2: replace(two.system, sigma_ref=2.0), 3: replace(two.system, widths=LevelWidths(scatter=0.9)),
+    }))  # fmt: skip
     found = compare_outgoing(two, strip).system
     assert found.sigma_ref * FWHM_PER_SIGMA == pytest.approx(fwhm)  # the outgoing pulse is taken
     for one in (found, found.digitizers[2]):
         assert one.widths.scatter == pytest.approx(0.05 * one.sigma_ref)
+    assert found.digitizers[3].widths.scatter == 0.9  # its echoes scatter by more
     block = WaveformBlock.from_samples(np.zeros((1, 60), np.uint8), spacing=1.0)
     waveform, time, amplitude, width = np.zeros(1, int), np.full(1, 30.0), np.full(1, 50.0), np.full(1, found.sigma_ref)
     echoes = EchoTable.build(waveform, time, amplitude, width, amplitude_err=np.ones(1))
@@ -191,6 +194,9 @@ def test_a_column_that_knows_few_pulses_is_not_used_unless_asked_for(tmp_path):
     assert "fewer than 20 of the sampled pulses have one" in said
     with pytest.raises(OSError, match="--energy pulse_energy knows 10 of 100"):
         _filled(path, "pulse_energy")
+    few = _strip(tmp_path / "few.las", np.ones(10))
+    with StripReader(few) as reader, reader.scan() as scan:
+        assert find_pulse_energy(reader, scan, None) is not None  # all that there are
 
 
 @pytest.mark.parametrize("known", [0.96, 0.4, 0.05])
