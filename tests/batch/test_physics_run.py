@@ -75,7 +75,7 @@ def test_a_calibration_adds_columns_and_the_strips_own_vectors_serve(plain):
 def test_errors_of_level_reflectances_take_the_slopes_of_the_strip(
     tmp_path, tiny_strip, calibration, monkeypatch, measured, used
 ):
-    monkeypatch.setattr("wavebatch.batch.unit.measure_slope", lambda reader, scan: measured)
+    monkeypatch.setattr("wavebatch.surveying.flat_ground.measure_slope", lambda reader, scan: measured)
     done = run(tiny_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration)
     assert done.exit_code == 0, done.output
     assert f"slope = {used}\n" in report(tmp_path)["chain"]

@@ -32,16 +32,7 @@ from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, STORE_PIECE, RowStore, Spool
 from wavebatch.files.las.header import field_names
-from wavebatch.kernels.geometry.normals import (
-    FINENESS,
-    Gap,
-    Surroundings,
-    Tiles,
-    cut_tiles,
-    is_inside,
-    sort_into_tiles,
-    thin_out,
-)
+from wavebatch.kernels.geometry import normals
 from wavebatch.stages.chain import Step
 
 TILE_POINTS = 150_000
@@ -56,7 +47,7 @@ PART_POINTS = 1 << 18
 ENTRY = np.dtype([("row", "<i8"), ("xyz", "<i4", 3), ("ray", "<f4", 3)])
 """One row: its number, its position as it is stored, and the unit vector of its ray (NaN: none)."""
 
-_REASONS = np.array([NoData[gap.name] for gap in Gap], np.uint8)
+_REASONS = np.array([NoData[gap.name] for gap in normals.Gap], np.uint8)
 """Why an echo has no value, by its gap."""
 
 PROTOCOL = pickle.HIGHEST_PROTOCOL
@@ -70,7 +61,7 @@ class TileTask:
     """Everything that the tiles of a strip share; picklable."""
 
     step: Step
-    tiles: Tiles
+    tiles: normals.Tiles
     entries: Spool
     """Points by tile, including those of its buffer."""
     scales: tuple[float, ...]
@@ -130,12 +121,12 @@ class SecondPass:
             return RunReport()
         start = Seconds.now()
         # Width of a tile's buffer [m]: cells that the radius touches must be complete.
-        reach = self._step.effective()["radius"] * (1.0 + 2.0 / FINENESS)
+        reach = self._step.effective()["radius"] * (1.0 + 2.0 / normals.FINENESS)
         sample = np.concatenate(self._sample)
         self._sample = []
         sample = sample[np.isfinite(sample).all(axis=1)]
         # Tiles much smaller than their buffers would list each point many times.
-        tiles = cut_tiles(sample, max(self._tile_points // self._every, 1), 8 * reach)
+        tiles = normals.cut_tiles(sample, max(self._tile_points // self._every, 1), 8 * reach)
         self._found.extend(self._rows.count)
         self._entries = Spool(len(tiles), ENTRY, memory=self._spooled)
         counts, at = np.zeros(len(tiles), np.int64), 0
@@ -143,7 +134,7 @@ class SecondPass:
             rows["row"] = np.arange(at, at + len(rows))
             place = rows["xyz"] * np.array(self._scales)
             able = np.flatnonzero(np.isfinite(place).all(axis=1))
-            index, tile = sort_into_tiles(tiles, place[able], reach)
+            index, tile = normals.sort_into_tiles(tiles, place[able], reach)
             counts += np.bincount(tile, minlength=len(tiles))
             self._entries.append(tile, rows[able[index]])
             at += len(rows)
@@ -244,7 +235,7 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> UnitResult:
     by_echo = np.zeros(len(made.counted), found.dtype)
     by_echo[made.echo[has_echo]] = found[has_echo]
     first, *_ = names = field_names(found.dtype)[:-1]
-    known = by_echo["gap"] == Gap.KNOWN
+    known = by_echo["gap"] == normals.Gap.KNOWN
     values = {name: np.where(known, by_echo[name], np.float32(np.nan)) for name in names}
     if f"{first}_err" in values:
         # A ray that is off turns the angle by as much: no plane of points shows it.
@@ -303,7 +294,7 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
             break
     entries = np.concatenate(pieces)
     place = task.place(entries["xyz"])
-    own = np.flatnonzero(is_inside(task.tiles, number, place))
+    own = np.flatnonzero(normals.is_inside(task.tiles, number, place))
     around = _gather(blob, number)
     values, gap = stage.second_pass(place[own], entries["ray"][own], around, **task.step.effective())
     found = np.empty(len(own), _found_dtype(task.step))
@@ -313,7 +304,7 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
 
 
 @functools.lru_cache(maxsize=1)
-def _gather(blob: bytes, number: int) -> Surroundings:
+def _gather(blob: bytes, number: int) -> normals.Surroundings:
     """The points of a tile and its buffer that count as neighbours."""
     task: TileTask = unpack(blob)
     radius = task.step.effective()["radius"]
@@ -324,9 +315,9 @@ def _gather(blob: bytes, number: int) -> Surroundings:
             held.append(piece)
         if held and (piece is None or sum(map(len, held)) >= task.part_points):
             kept = np.concatenate([kept, *held])
-            kept = kept[thin_out(task.place(kept["xyz"]), kept["row"], radius)]
+            kept = kept[normals.thin_out(task.place(kept["xyz"]), kept["row"], radius)]
             held = []
-    return Surroundings(task.place(kept["xyz"]))
+    return normals.Surroundings(task.place(kept["xyz"]))
 
 
 def _found_dtype(step: Step) -> np.dtype:

@@ -38,15 +38,9 @@ from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.kernels.geometry.normals import find_edges
 from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Solved, Step
+from wavebatch.surveying import flat_ground
 from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import ChainChoice, try_chain
-from wavebatch.surveying.flat_ground import (
-    GroundReference,
-    angle_parameters,
-    choose_radius,
-    measure_slope,
-    sample_reference,
-)
 from wavebatch.surveying.matching.setting import doubt_zone
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorSource, judge_scale, refuse_units
@@ -190,9 +184,10 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
             steps = []
             for step in job.chain.steps:
                 if step.stage.second_pass is not None and step.effective()["radius"] == 0:
-                    step = replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
+                    radius = flat_ground.choose_radius(reader, scan)
+                    step = replace(step, parameters={**step.parameters, "radius": radius})
                 elif step.stage.name == "attribute.level_reflectance" and not step.parameters:
-                    slope = max(step.effective()["slope"], round(measure_slope(reader, scan), 1))
+                    slope = max(step.effective()["slope"], round(flat_ground.measure_slope(reader, scan), 1))
                     step = replace(step, parameters={"slope": min(slope, STEEP)})
                 steps.append(step)
             job = replace(job, chain=replace(job.chain, steps=tuple(steps)))
@@ -212,7 +207,7 @@ def _see_level(
 ) -> tuple[ChainChoice, tuple[str, ...]]:
     """The choice with the widths of surfaces that face the sensor, where angles are computed and no saved survey has
     them; and what is doubtful about the beam."""
-    parameters = angle_parameters(job.chain)
+    parameters = flat_ground.angle_parameters(job.chain)
     survey, figures = choice.survey, choice.survey.figures
     if parameters is None or sensor.kind == UNKNOWN.kind:
         return choice, ()
@@ -221,9 +216,9 @@ def _see_level(
     used = used.with_radiometry(divergence=divergence)
     if job.request.system is not None and not job.request.flight and survey.system.widths.error is not None:
         beam = figures.divergence_seen_mrad
-        seen = GroundReference(used, 0, beam, (figures.divergence_seen_error_mrad or 0.0) / (beam or 1.0))
+        seen = flat_ground.GroundReference(used, 0, beam, (figures.divergence_seen_error_mrad or 0.0) / (beam or 1.0))
     else:
-        seen = sample_reference(reader, scan, sensor, used, figures.spacing_ns or 0.0)
+        seen = flat_ground.sample_reference(reader, scan, sensor, used, figures.spacing_ns or 0.0)
     doubt, error = seen.doubt(), seen.doubt_error() or survey.system.radiometry.divergence_error
     system = _take_reference(survey.system, seen.system).with_radiometry(divergence_error=error)
     return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()

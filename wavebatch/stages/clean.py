@@ -13,13 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
-from wavebatch.kernels.signal.defects import (
-    fill_spikes,
-    find_pattern,
-    find_spikes,
-    find_transient,
-    fit_slopes,
-)
+from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, transpose_samples
 from wavebatch.stages.pulse_tables import clip_level, floor_level

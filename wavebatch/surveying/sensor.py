@@ -23,16 +23,7 @@ from wavebatch.files.disk.raw_bytes import naming
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import LEAST_PAIRS, RaySample, StripReader, StripScan, measure_scale, sample_rays
 from wavebatch.files.trajectory_file import read_trajectory
-from wavebatch.kernels.geometry.ray_convergence import (
-    CLIP,
-    SensorFit,
-    TurnSeen,
-    fit_best,
-    measure_extent,
-    measure_turn,
-    range_error,
-    sensor_at,
-)
+from wavebatch.kernels.geometry import ray_convergence
 from wavebatch.kernels.physics.radiometry import mean_haze
 from wavebatch.surveying.measuring.return_scatter import ReturnScatter
 
@@ -261,7 +252,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     if len(vectors.time) >= LEAST_RAYS and vectors.time[0] < vectors.time[-1]:
         with np.errstate(invalid="ignore", divide="ignore"):
             unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
-        spread = measure_extent(unit)
+        spread = ray_convergence.measure_extent(unit)
         if spread > LEAST_SPREAD:
             facts["do_not_meet_deg"] = round(float(np.degrees(spread)), 1)
     if request.height is None:
@@ -413,7 +404,7 @@ def _from_file(
 
 
 def find_turn(
-    vectors: RaySample, pairs: RaySample, fits: Sequence[SensorFit]
+    vectors: RaySample, pairs: RaySample, fits: Sequence[ray_convergence.SensorFit]
 ) -> tuple[dict[str, Any], np.ndarray, float]:
     """Find by how much packet vectors are turned against the points, alike in the whole strip.
 
@@ -441,13 +432,13 @@ def find_turn(
     docs/algorithms.md 5.1.
     """
     known, right, shift = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
-    parts: list[TurnSeen] = []
+    parts: list[ray_convergence.TurnSeen] = []
     end = -np.inf
     for fit in fits:
         if fit.centre - fit.half > end:  # windows that overlap have the same rays
             rows = np.flatnonzero(np.abs(vectors.time - fit.centre) <= fit.half)
             window = [values[rows[:: max(1, len(rows) // MOST_RAYS)]] for values in vectors[:4]]
-            parts.append(measure_turn(fit, *window))
+            parts.append(ray_convergence.measure_turn(fit, *window))
             end = fit.centre + fit.half
     if parts:
         each, sides, floors, shifts = (np.stack(values) for values in zip(*parts, strict=True))
@@ -501,7 +492,7 @@ def _turn_by_pairs(pairs: RaySample) -> tuple[np.ndarray, np.ndarray]:
     left = off
     for _ in range(3):
         size = np.sqrt((left * left).sum(axis=1))
-        good = size <= CLIP * max(float(np.median(size)), 1e-12)
+        good = size <= ray_convergence.CLIP * max(float(np.median(size)), 1e-12)
         normal, right = (
             np.einsum("nki,nkj->ij", turns[good], turns[good]),
             np.einsum("nki,nk->i", turns[good], off[good]),
@@ -553,14 +544,14 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     nodes = np.unique(cells)
     if len(nodes) > MOST_NODES:
         return None
-    found: list[tuple[SensorFit, np.ndarray, np.ndarray]] = []
+    found: list[tuple[ray_convergence.SensorFit, np.ndarray, np.ndarray]] = []
     for node in nodes.tolist():
         own = np.searchsorted(cells, [node, node + 1])
         low, high = float(rays.time[own[0]]), float(rays.time[own[1] - 1])
         for reach in WIDER:  # the smallest window that gives a fit
             start, stop = np.searchsorted(cells, [node - reach, node + reach + 1])
             rows = np.arange(start, stop, max(1, (stop - start) // MOST_RAYS))
-            fit = fit_best(rays.time[rows], rays.point[rows], rays.direction[rows], rays.weight[rows])
+            fit = ray_convergence.fit_best(rays.time[rows], rays.point[rows], rays.direction[rows], rays.weight[rows])
             if fit is not None:
                 break
         if fit is None:
@@ -577,7 +568,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     if not found:
         return None
     time, inside = (np.concatenate([part[i] for part in found]) for i in (1, 2))
-    placed = [sensor_at(fit, within) for fit, _, within in found]
+    placed = [ray_convergence.sensor_at(fit, within) for fit, _, within in found]
     xyz, velocity = (np.concatenate([part[i] for part in placed]) for i in (0, 1))
     xyz += velocity * (time - inside)[:, None]
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
@@ -589,14 +580,14 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
         direction = rays.direction[near][:64]
         direction = direction / np.sqrt((direction**2).sum(axis=1))[:, None]
         at = np.full(len(direction), within[len(within) // 2])
-        squares.append(np.mean(range_error(fit, at, direction) ** 2))
+        squares.append(np.mean(ray_convergence.range_error(fit, at, direction) ** 2))
         later = found[number + 1][0] if number + 1 < len(found) else None
         if later is not None and later.centre - fit.centre <= fit.half + later.half:
             # Difference of their positions in the middle of what they share [m].
             low = max(fit.centre - fit.half, later.centre - later.half)
             high = min(fit.centre + fit.half, later.centre + later.half)
             middle = np.array([0.5 * (low + high)])
-            off = (sensor_at(later, middle)[0] - sensor_at(fit, middle)[0])[0]
+            off = (ray_convergence.sensor_at(later, middle)[0] - ray_convergence.sensor_at(fit, middle)[0])[0]
             apart.append(np.mean((direction @ off) ** 2))
     if len(apart) >= LEAST_OVERLAPS:
         motion = 0.5 * np.mean(apart)  # both windows are off
@@ -614,7 +605,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
 
 
 def _describe(
-    found: list[tuple[SensorFit, np.ndarray, np.ndarray]], path: Trajectory, rays: RaySample
+    found: list[tuple[ray_convergence.SensorFit, np.ndarray, np.ndarray]], path: Trajectory, rays: RaySample
 ) -> tuple[tuple[str, Any], ...]:
     """Height, speed, heading and smoothness of a path, for reports."""
     speed = np.sqrt((path.velocity**2).sum(axis=1))

@@ -51,11 +51,7 @@ from wavebatch.surveying.measuring.residuals import decompose_again, decompose_s
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures
-from wavebatch.surveying.systems.known_systems import (
-    guess_width,
-    list_known,
-    share_repeated,
-)
+from wavebatch.surveying.systems.known_systems import guess_width, list_known, share_repeated
 from wavebatch.surveying.systems.skew import measure_skew
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 

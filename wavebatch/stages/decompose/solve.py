@@ -15,15 +15,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.decompose import (
-    Candidates,
-    Clusters,
-    Settings,
-    Solution,
-    cluster_candidates,
-    decompose_clusters,
-    keep_echoes,
-)
+from wavebatch.kernels.fit import decompose
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, matched_gaussian, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.noise import whitening_filter
@@ -67,9 +59,9 @@ def find_clusters(
     noise: Noise,
     system: SystemPulse,
     echoes: EchoTable,
-    settings: Settings,
+    settings: decompose.Settings,
     most: int = MOST_JOINED,
-) -> tuple[Candidates, Clusters]:
+) -> tuple[decompose.Candidates, decompose.Clusters]:
     """Turn candidates into parameters of the pulse in samples, and group those that must be fitted together.
 
     Parameters
@@ -93,10 +85,11 @@ def find_clusters(
     columns = np.maximum(echoes.amplitude, 0), echoes.time / block.spacing, echoes.sigma / block.spacing
     start = np.stack(columns, axis=1).astype(np.float64)
     amplitude, time, width = model_parameters(settings.shape, limits, start).T
-    candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
+    width = np.clip(width, limits.low, limits.high)
+    candidates = decompose.Candidates(echoes.waveform.astype(np.int64), time, amplitude, width)
     candidates = _join_plateaus(block, candidates, clip_level(block, system))
     candidates, tail = _explain_tails(candidates, noise, settings, ref)
-    clusters = cluster_candidates(
+    clusters = decompose.cluster_candidates(
         samples_of(block, noise),
         candidates,
         margin=int(np.ceil(MARGIN * ref)),
@@ -107,7 +100,7 @@ def find_clusters(
     return candidates, clusters
 
 
-def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float) -> Candidates:
+def _join_plateaus(block: WaveformBlock, candidates: decompose.Candidates, clip: float) -> decompose.Candidates:
     """Candidates, one for each flat top: clipped samples between two candidates are no sign of two echoes."""
     waveform, time, amplitude, _ = candidates
     if len(waveform) < 2:
@@ -130,13 +123,13 @@ def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float) ->
     first = np.flatnonzero(~joined)
     number = np.diff(np.r_[first, len(waveform)])
     middle = np.add.reduceat(time, first) / number
-    kept = Candidates(*(field[first] for field in candidates))
+    kept = decompose.Candidates(*(field[first] for field in candidates))
     return kept._replace(time=np.where(number > 1, middle, kept.time), amplitude=np.maximum.reduceat(amplitude, first))
 
 
 def _explain_tails(
-    candidates: Candidates, noise: Noise, settings: Settings, ref: float
-) -> tuple[Candidates, np.ndarray | None]:
+    candidates: decompose.Candidates, noise: Noise, settings: decompose.Settings, ref: float
+) -> tuple[decompose.Candidates, np.ndarray | None]:
     """Candidates that after-pulses of stronger echoes do not explain, and how far tails reach (docs/algorithms.md H7).
 
     Growth finds a dropped candidate again if the fit of the stronger echo leaves a residual there. `ref` is the width
@@ -156,7 +149,7 @@ def _explain_tails(
     keep = amplitude - expected > 2.2 * std + 0.5 * expected
     # A tail below the noise of what found a candidate does not explain it, however broad the pulse is.
     keep |= expected <= choose_smoothing(ref)[2] * std
-    candidates = Candidates(*(field[keep] for field in candidates))
+    candidates = decompose.Candidates(*(field[keep] for field in candidates))
     return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 
 
@@ -227,7 +220,7 @@ def make_settings(
     shape: PulseShape,
     fit: FitOptions,
     **options: Any,
-) -> Settings:
+) -> decompose.Settings:
     """Collect what a decomposition with this pulse may do: the strip's widths, digitizer and noise.
 
     Parameters
@@ -251,7 +244,7 @@ def make_settings(
     noise = system.noise
     # It makes the noise white, with `noise.std`.
     whitening = whitening_filter(noise.whitening, noise.std / noise.quiet) if noise.whitening else None
-    return Settings(
+    return decompose.Settings(
         *limits, shape=shape, clip=clip_level(block, system), floor=floor, noise_gain=noise.gain,
         tolerance=fit.tolerance, max_iterations=fit.max_iterations, whitening=whitening, **options,
     )  # fmt: skip
@@ -262,7 +255,7 @@ def fit_candidates(
     noise: Noise,
     system: SystemPulse,
     echoes: EchoTable,
-    settings: Settings,
+    settings: decompose.Settings,
     *,
     significance: float,
     most: int = MOST_JOINED,
@@ -287,9 +280,9 @@ def fit_candidates(
     """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
     samples = samples_of(block, noise)
-    solution = decompose_clusters(samples, candidates, clusters, settings)
+    solution = decompose.decompose_clusters(samples, candidates, clusters, settings)
 
-    def describe(clusters: Clusters, solution: Solution) -> EchoTable:
+    def describe(clusters: decompose.Clusters, solution: decompose.Solution) -> EchoTable:
         columns = {CLUSTER: solution.cluster} if settings.known else {}
         return describe_solution(block, noise, system, clusters, solution, settings, significance, columns)
 
@@ -313,10 +306,10 @@ CLUSTER, FACTOR = "cluster", "factor"
 def _leave_out_unknown(
     table: EchoTable,
     samples: Samples,
-    clusters: Clusters,
-    solution: Solution,
-    settings: Settings,
-    describe: Callable[[Clusters, Solution], EchoTable],
+    clusters: decompose.Clusters,
+    solution: decompose.Solution,
+    settings: decompose.Settings,
+    describe: Callable[[decompose.Clusters, decompose.Solution], EchoTable],
 ) -> EchoTable:
     """Leave out echoes whose amplitudes are unknown by their final errors, which hold misfits of the pulse too.
 
@@ -332,7 +325,8 @@ def _leave_out_unknown(
     part, own = np.flatnonzero(is_part[clusters.waveform]), is_part[table.waveform]
     rest, table = _leave_out_explained(table.take(~own), solution), table.take(own)
     table = table.with_attributes(**{CLUSTER: np.searchsorted(part, table.attributes[CLUSTER])})
-    clusters, solution, noise = Clusters(*(column[part] for column in clusters)), solution.take(part), noise[part]
+    clusters = decompose.Clusters(*(column[part] for column in clusters))
+    solution, noise = solution.take(part), noise[part]
     again = settings._replace(grow=False, acceptance=settings.known**2)
     for _ in range(ROUNDS):
         larger = _find_unknown(table, settings, noise)
@@ -351,20 +345,21 @@ def _leave_out_unknown(
         some = Samples(*columns)
         some = some._replace(std=(some.std * factor).astype(np.float32))
         first = np.cumsum(old.number) - old.number
-        windows = Clusters(place, clusters.low[rows], clusters.high[rows], first, old.number)
-        new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, again)
+        windows = decompose.Clusters(place, clusters.low[rows], clusters.high[rows], first, old.number)
+        known = decompose.Candidates(place[old.cluster], time, amplitude, width)
+        new = decompose.decompose_clusters(some, known, windows, again)
         each = factor[new.cluster]
         fitted = new._replace(
             misfit=new.misfit * each, cost=new.cost * factor**2, errors=new.errors / each[:, None],
             shared=new.shared / each[:, None] ** 2,
         )  # fmt: skip
-        solution = Solution(*map(np.concatenate, zip(solution, fitted, strict=True))).take(order)
+        solution = decompose.Solution(*map(np.concatenate, zip(solution, fitted, strict=True))).take(order)
         table = describe(clusters, solution)
     both = EchoTable.concatenate((rest, _leave_out_explained(table, solution)))
     return both.take(np.argsort(both.waveform, kind="stable"))
 
 
-def _leave_out_explained(table: EchoTable, solution: Solution) -> EchoTable:
+def _leave_out_explained(table: EchoTable, solution: decompose.Solution) -> EchoTable:
     """The table without echoes alone in their cluster that are no higher than what a stronger one leaves beside it.
 
     Their errors say so. The columns of the decomposer go.
@@ -375,7 +370,7 @@ def _leave_out_explained(table: EchoTable, solution: Solution) -> EchoTable:
     return replace(table, attributes={}).take(~explained)
 
 
-def _find_unknown(table: EchoTable, settings: Settings, noise: np.ndarray) -> np.ndarray:
+def _find_unknown(table: EchoTable, settings: decompose.Settings, noise: np.ndarray) -> np.ndarray:
     """Noise of each cluster, over that of a fit, in which its unknown echoes must be asked; 0 without any.
 
     noise: float64 (c,), the noise in which they were asked already.
@@ -398,9 +393,9 @@ def describe_solution(
     block: WaveformBlock,
     noise: Noise,
     system: SystemPulse,
-    clusters: Clusters,
-    solution: Solution,
-    settings: Settings,
+    clusters: decompose.Clusters,
+    solution: decompose.Solution,
+    settings: decompose.Settings,
     significance: float,
     attributes: Mapping[str, np.ndarray] | None = None,
 ) -> EchoTable:
@@ -437,7 +432,7 @@ def describe_solution(
         level_err = (noise.baseline_err / noise.std)[np.repeat(clusters.waveform, solution.number)]
     factors = error_factors(fitted, spacing, widths, level_err)
     whole = whole_pulse(settings.shape, limits, widths)
-    columns, row = keep_echoes(clusters, solution, whole, factors, noise.std, spacing, length, significance)
+    columns, row = decompose.keep_echoes(clusters, solution, whole, factors, noise.std, spacing, length, significance)
     if CLUSTER in given:
         # Colour that makes errors larger is left to the acceptance, which has made `noise.std` of it.
         given = {**given, FACTOR: np.minimum(factors[:, 0], 1.0).astype(np.float32)}

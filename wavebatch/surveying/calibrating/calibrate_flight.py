@@ -24,28 +24,10 @@ from wavebatch.core.waveforms import angle_across, angle_to_vertical, swath_colu
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.las.header import read_header
-from wavebatch.surveying.calibrating.adjust_flight import (
-    TIE,
-    VIEW,
-    Adjustment,
-    Anchors,
-    PairOverlap,
-    Ties,
-    adjust_constants,
-    choose_size,
-    compare_pairs,
-    find_doubts,
-    hash_squares,
-    measure_ties,
-)
+from wavebatch.surveying.calibrating import adjust_flight as adjust
 from wavebatch.surveying.calibrating.calibration_files import Target
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, open_source
-from wavebatch.surveying.calibrating.targets import (
-    MOST_ECHOES,
-    build_calibration,
-    describe_channel,
-    measure_ranging,
-)
+from wavebatch.surveying.calibrating.targets import MOST_ECHOES, build_calibration, describe_channel, measure_ranging
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, check_attenuation
 from wavebatch.surveying.matching.setting import PLACES, SCANNERS, number_channel, see_channels
 from wavebatch.surveying.matching.strip_energies import StripEnergies
@@ -133,11 +115,11 @@ def read_strip(
             inside = np.zeros(len(xyz), bool)
             for bottom, top in tied:
                 inside |= ((xyz[:, :2] >= bottom) & (xyz[:, :2] <= top)).all(axis=1)
-            return inside & (hash_squares(xyz) < share)
+            return inside & (adjust.hash_squares(xyz) < share)
 
         if source.column is not None:
             part = MOST_OF_COLUMN / max(source.scan.packets, 1)
-            near = lambda xyz: hash_squares(xyz) < part  # noqa: E731
+            near = lambda xyz: adjust.hash_squares(xyz) < part  # noqa: E731
             inside = [near]
         else:
             corners = np.concatenate([target.corners for target in targets])
@@ -145,13 +127,13 @@ def read_strip(
             near = lambda xyz: ((xyz[:, :2] >= first) & (xyz[:, :2] <= last)).all(axis=1)  # noqa: E731
             inside = [target.contains for target in targets]
         parts: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in inside]
-        shorts = [np.empty(0, TIE)]
+        shorts = [np.empty(0, adjust.TIE)]
         for rows in source.echoes(lambda xyz: near(xyz) | ties_at(xyz)):
             for contains, some in zip(inside, parts, strict=True):
                 if sum(map(len, some)) < MOST_ECHOES:
                     some.append(rows[contains(rows["xyz"])])
             rows = rows[ties_at(rows["xyz"]) & np.isfinite(rows["light_err"])]
-            short = np.empty(len(rows), TIE)
+            short = np.empty(len(rows), adjust.TIE)
             short["xyz"] = rows["xyz"] - [*boxes[0][0], 0.0]
             short["source"] = rows["channel"]
             for name in ("ray", "light", "distance", "time"):
@@ -167,7 +149,7 @@ def read_strip(
         # How each channel saw the targets in the middle; good targets are level.
         on, views = np.concatenate(on_targets), {}
         for channel in np.unique(on["channel"]).tolist():
-            mine, view = on[on["channel"] == channel], np.zeros(1, VIEW)[0]
+            mine, view = on[on["channel"] == channel], np.zeros(1, adjust.VIEW)[0]
             view["angle"] = np.median(angle_across(mine["ray"], source.setting.right))
             view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
             view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
@@ -218,7 +200,9 @@ class Trend(NamedTuple):
     """Root mean square of what it changes against the places of the targets, relative."""
 
 
-def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustment, tuple[float, ...], float | None]:
+def fit_swath(
+    ties: adjust.Ties, anchors: adjust.Anchors, seen: np.ndarray
+) -> tuple[adjust.Adjustment, tuple[float, ...], float | None]:
     """Adjust the constants with a term over the scan angle.
 
     Parameters
@@ -249,11 +233,11 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     # Do constants and a term that is alike on both sides stand for one that falls from side to side?
     # They do where headings are alike, and where two strips of opposite headings overlap.
     falling = replace(ties, value=columns[:, 2], error=np.full(len(columns), 1e-3))
-    free = Anchors(0.0 * anchors.value, 1e3 * np.ones(len(anchors.value)), np.zeros((len(anchors.value), 2)))
-    rest = adjust_constants(falling, free, columns[:, :2], 0).residual
+    free = adjust.Anchors(0.0 * anchors.value, 1e3 * np.ones(len(anchors.value)), np.zeros((len(anchors.value), 2)))
+    rest = adjust.adjust_constants(falling, free, columns[:, :2], 0).residual
     odd = bool(len(rest) and np.nanstd(rest) > LEAST_LEFT)
     used = 3 if odd else 2
-    adjusted = adjust_constants(ties, replace(anchors, columns=at_targets[:, :used]), columns[:, :used])
+    adjusted = adjust.adjust_constants(ties, replace(anchors, columns=at_targets[:, :used]), columns[:, :used])
     if len(ties.cell):
         edge = max(float(np.std(adjusted.term_trials @ side[:used], ddof=1)) for side in _EDGES)
     if not 0 < edge <= MOST_EDGE_ERROR:
@@ -265,7 +249,7 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
         return adjusted, (most, *map(float, adjusted.terms)), None
     # The error of the constants if they differ because each strip was seen from another side, or if the light falls
     # from side to side and not to both edges, where that explains the overlaps nearly as well.
-    other = adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
+    other = adjust.adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
     side = columns[:, 2]
     n, grid = len(adjusted.value), np.linspace(-1.0, 1.0, 21)
     place = np.bincount(ties.source, side, n) / np.maximum(adjusted.ties, 1)
@@ -279,7 +263,9 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     return adjusted, (most, *map(float, adjusted.terms), 0.0), error
 
 
-def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustment) -> Trend | None:
+def find_trend(
+    ties: adjust.Ties, anchors: adjust.Anchors, seen: np.ndarray, adjusted: adjust.Adjustment
+) -> Trend | None:
     """Find what explains most of the scatter that constants leave in the overlaps; None where nothing explains a part.
 
     Parameters
@@ -295,7 +281,8 @@ def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustm
         return None
     for name, columns, at_targets in _list_columns(ties, seen):
         known = np.isfinite(at_targets).all(axis=1)
-        fit = adjust_constants(ties, replace(anchors, columns=np.where(known[:, None], at_targets, 0.0)), columns, 0)
+        shown = replace(anchors, columns=np.where(known[:, None], at_targets, 0.0))
+        fit = adjust.adjust_constants(ties, shown, columns, 0)
         if fit.scatter >= least:
             continue
         used = np.isfinite(fit.residual)
@@ -307,7 +294,7 @@ def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustm
     return best
 
 
-def _list_columns(ties: Ties, seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+def _list_columns(ties: adjust.Ties, seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Name, columns (k, m) at the ties and (n, m) at the targets, of each quantity."""
     view = ties.view
     most = float(np.abs(view["angle"]).max())
@@ -337,7 +324,7 @@ class FlightCalibration:
     """A calibration of several strips, and how they agree."""
 
     calibration: Calibration
-    pairs: tuple[PairOverlap, ...] = ()
+    pairs: tuple[adjust.PairOverlap, ...] = ()
     cell: float = 0.0
     """Edge of the tie cells [m]."""
 
@@ -396,22 +383,22 @@ def calibrate_flight(
     if len(sources) == 1 and not options.scan_angle:
         return FlightCalibration(good[0].widened(bent))
     rights = np.array([source.strip.right for source in sources])
-    parts = [np.empty(0, TIE)]
+    parts = [np.empty(0, adjust.TIE)]
     for number, source in enumerate(sources):
         rows = source.strip.ties[source.strip.ties["source"] == source.channel]
         rows["source"] = number
         parts.append(rows)
     rows = np.concatenate(parts)
-    ties = measure_ties(rows, choose_size(rows), rights=rights)
+    ties = adjust.measure_ties(rows, adjust.choose_size(rows), rights=rights)
     value, error = np.full((2, len(sources)), np.nan)
-    seen = np.full(len(sources), np.nan, VIEW)
+    seen = np.full(len(sources), np.nan, adjust.VIEW)
     for number, source in enumerate(sources):
         given, found = source.given, source.strip.found
         if given is not None and found is not None:
             rest = given.relative_error**2 - _reflectance_error([found], options) ** 2
             value[number], error[number] = math.log(given.constant), math.sqrt(max(rest, 1e-6))
             seen[number] = source.strip.seen[source.channel]
-    anchors = Anchors(value, error)
+    anchors = adjust.Anchors(value, error)
     swath: tuple[float, ...] = ()
     open_error = None
     if options.scan_angle:
@@ -419,10 +406,10 @@ def calibrate_flight(
         ties = replace(ties, value=ties.value + swath_columns(ties.view["angle"], swath[0]) @ swath[1:])
         anchors = replace(anchors, value=anchors.value - swath_columns(seen["angle"], swath[0]) @ swath[1:])
     else:
-        adjusted = adjust_constants(ties, anchors)
+        adjusted = adjust.adjust_constants(ties, anchors)
     calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath)
     names = [source.name for source in sources]
-    pairs = tuple(compare_pairs(ties, adjusted, names))
+    pairs = tuple(adjust.compare_pairs(ties, adjusted, names))
     lost = []
     for source, value in zip(sources, adjusted.value, strict=True):
         # A run takes the constant of other channels for one that differs in its samples per waveform only.
@@ -433,7 +420,7 @@ def calibrate_flight(
         covered = alike and all(one.samples != row.samples for one in alike)
         if not (np.isfinite(value) or covered):
             lost.append(source.name)
-    notes = [*calibration.notes, *find_doubts(lost, calibration.strips, pairs)]
+    notes = [*calibration.notes, *adjust.find_doubts(lost, calibration.strips, pairs)]
     # What the overlaps leave unexplained is in the errors; where it is more than these, it is said.
     trend, more = find_trend(ties, anchors, seen, adjusted), []
     spread = adjusted.scatter if trend is None else max(adjusted.scatter, trend.spread)
@@ -461,7 +448,7 @@ def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions
 
 
 def _assemble(
-    strips: Sequence[FlightStrip], sources: Sequence[Source], adjusted: Adjustment, options: CalibrationOptions
+    strips: Sequence[FlightStrip], sources: Sequence[Source], adjusted: adjust.Adjustment, options: CalibrationOptions
 ) -> Calibration:
     """The calibration of the flight: a constant per channel, and one per channel and strip."""
     good = [strip.found for strip in strips if strip.found is not None]

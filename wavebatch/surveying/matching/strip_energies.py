@@ -19,13 +19,7 @@ from wavebatch.files.pulse_energy import COLUMN, LEAST_KNOWN, LEAST_SHARE, Pulse
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import CHANGE_CHANCE, Calibration
-from wavebatch.surveying.matching.setting import (
-    QUANTILES,
-    SCANNERS,
-    compare_scenes,
-    take_off_level,
-    weigh_alike,
-)
+from wavebatch.surveying.matching.setting import QUANTILES, SCANNERS, compare_scenes, take_off_level, weigh_alike
 
 OTHER_UNIT = 3.0
 """Ratio of mean energies from which a log is in another unit: lasers lose a half of their energy at most."""
