@@ -22,8 +22,7 @@ from wavebatch.batch.options import describe_options
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.command import group_options
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.stages.chain import KINDS, STAGES
-from wavebatch.stages.chain_file import format_step
+from wavebatch.stages.chain import KINDS, STAGES, format_step
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:

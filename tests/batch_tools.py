@@ -9,7 +9,7 @@ import numpy as np
 from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import load_profile
 
 
 def make_job(path, *, profile="fast", columns=None, **options) -> StripJob:

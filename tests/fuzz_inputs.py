@@ -14,7 +14,7 @@ from pulse_files import Pulse, PulseFile, Sampling, bell
 from strips import vlr
 
 from wavebatch.files.las.header import ExtraRecord, build_dtype
-from wavebatch.stages.chain_file import effective, load_profile
+from wavebatch.stages.chain import effective, load_profile
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions
 

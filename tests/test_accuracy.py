@@ -11,8 +11,7 @@ from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import crlb
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.stages.decompose.merge import merge_unresolved
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block
 

@@ -16,7 +16,7 @@ from commands import run_command
 
 import wavebatch as wb
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.stages.chain_file import list_profiles
+from wavebatch.stages.chain import list_profiles
 from wavebatch.surveying.systems.figures import describe_figures
 from wavebatch.tools.simulate import simulate_strip
 

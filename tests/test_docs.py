@@ -17,8 +17,7 @@ from click.testing import CliRunner
 from wavebatch.cli import COMMANDS, main
 from wavebatch.core.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
 from wavebatch.kernels.build_kernels import LIBRARY
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import list_profiles, parse_chain
+from wavebatch.stages.chain import STAGES, list_profiles, parse_chain
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -183,7 +182,7 @@ def test_a_wheel_holds_all_and_works_outside_the_repository(tmp_path):
     assert not [name for name in names if not re.match(r"wavebatch(-[\w.]+\.dist-info)?/", name)]
     # Where the repository is installed as an editable package, its path must not come before the wheel's.
     code = (
-        "import wavebatch, sys; from wavebatch.stages.chain_file import list_profiles, load_profile; "
+        "import wavebatch, sys; from wavebatch.stages.chain import list_profiles, load_profile; "
         "from wavebatch.kernels.library import load; load(); "
         "print(wavebatch.__file__); [load_profile(name) for name in list_profiles()]"
     )

@@ -27,7 +27,7 @@ INSIDE = {
         {"futures", "serve", "worker_check"}, {"spawned"}, {"processes"}, {"dask_cluster"},
     ],
     "surveying": [
-        {"measuring"}, {"look", "predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},
+        {"measuring"}, {"look", "predict_error"}, {"survey", "sensor"}, {"outgoing"},
         {"choose_chain", "inspect_strip", "calibration"}, {"flat_ground", "flight"}, {"prepare"},
     ],
 }

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import list_profiles, load_profile
+from wavebatch.stages.chain import STAGES, list_profiles, load_profile
 
 CORE = ("waveform", "time", "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "residual", "flags")
 N_SAMPLES = 72

@@ -7,7 +7,7 @@ import pytest
 
 import wavebatch
 from wavebatch.cli import COMMANDS
-from wavebatch.stages.chain_file import list_profiles
+from wavebatch.stages.chain import list_profiles
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text("utf-8")

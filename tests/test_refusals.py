@@ -20,7 +20,7 @@ from strips import make_raw
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.schema import Above, declared_options
-from wavebatch.stages.chain_file import effective, load_profile
+from wavebatch.stages.chain import effective, load_profile
 from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.tools.plots.waveform import MOST

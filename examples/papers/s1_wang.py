@@ -19,7 +19,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.signal.signal import find_peaks
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import parse_chain
 from wavebatch.stages.decompose.fit import gaussian, residual_loop
 from wavebatch.stages.decompose.models import render_table, skewed
 from wavebatch.stages.detect.direct import maximum, signal_above

@@ -26,7 +26,7 @@ from wavebatch.kernels.physics.incidence import (
     spread_pulse,
     spread_variance,
 )
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import parse_chain
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.direct import maximum
 from wavebatch.tools.simulate.render import record_counts

@@ -7,8 +7,7 @@ from commands import run_command
 import wavebatch as wb
 from wavebatch.batch.options import OPTIONS
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.surveying.calibration import needs_sensor, with_columns
 
 MADE = sorted({name for stage in STAGES.values() if stage.kind == "attribute" for name in stage.makes} & COLUMNS.keys())

@@ -10,7 +10,7 @@ from commands import run_command
 from helpers_scenes import make_scene
 
 import wavebatch as wb
-from wavebatch.surveying.system_file import format_survey, load_survey
+from wavebatch.surveying.systems.survey_result import format_survey, load_survey
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 
 

@@ -24,8 +24,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.kernels.geometry.normals import Gap
-from wavebatch.stages.chain import STAGES, Stage, Step
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import STAGES, Stage, Step, parse_chain
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 

@@ -16,7 +16,7 @@ from wavebatch.batch.run import run_batch
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import publish
 from wavebatch.files.text_file import find_strips
-from wavebatch.stages.chain_file import effective, load_profile
+from wavebatch.stages.chain import effective, load_profile
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions
 

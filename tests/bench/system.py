@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from wavebatch.stages.chain import Chain
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import Chain, load_profile
 from wavebatch.tools.bench.accuracy import median_range
 from wavebatch.tools.bench.command import Worker, peak_memory, run_file
 from wavebatch.tools.simulate import find_scene, simulate_strip

@@ -27,8 +27,7 @@ from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOpt
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli import command as program
 from wavebatch.cli.command import GROUPS, ProgramCommand, complete_files, roff
-from wavebatch.stages.chain import STAGES, Step
-from wavebatch.stages.chain_file import effective, parse_chain
+from wavebatch.stages.chain import STAGES, Step, effective, parse_chain
 
 
 def invoke(*arguments, **environment):

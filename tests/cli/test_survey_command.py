@@ -9,12 +9,11 @@ from strips import cut_strip
 
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.raw_bytes import take_fingerprint
-from wavebatch.stages.chain_file import load_chain_file
+from wavebatch.stages.chain import load_chain_file
 from wavebatch.surveying import Survey
 from wavebatch.surveying.choose_chain import chain_text, decide
-from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems.figures import Figures, describe_figures
-from wavebatch.surveying.systems.survey_result import Tried
+from wavebatch.surveying.systems.survey_result import Tried, load_survey
 from wavebatch.tools.sheets.sheet import list_lines
 from wavebatch.tools.sheets.survey import NOISE_KINDS, survey_sheet
 from wavebatch.tools.simulate import simulate_strip

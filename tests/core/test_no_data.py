@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from wavebatch.cli.messages import format_json
-from wavebatch.core.no_data import NoData, count_reasons, explain_no_data, without_nan
+from wavebatch.core.echoes import NoData, count_reasons, explain_no_data, without_nan
 
 
 def test_json_has_null_for_what_is_no_number():

@@ -23,8 +23,7 @@ from wavebatch.files.strip.packet_check import packed_bytes
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.kernels.signal.signal import LEAST_LEVEL, find_fill, quiet_fill, recorded_lengths
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.stages.noise import pooled, tail
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample

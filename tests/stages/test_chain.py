@@ -10,8 +10,7 @@ from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages import chain as chain_module
-from wavebatch.stages.chain import STAGES, Chain, Range, Step, stage
-from wavebatch.stages.chain_file import list_profiles, load_profile
+from wavebatch.stages.chain import STAGES, Chain, Range, Step, list_profiles, load_profile, stage
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0))
 

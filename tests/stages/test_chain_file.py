@@ -5,8 +5,16 @@ import pytest
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.stages.chain import STAGES, Chain, stage
-from wavebatch.stages.chain_file import effective, list_profiles, load_chain_file, load_profile, parse_chain
+from wavebatch.stages.chain import (
+    STAGES,
+    Chain,
+    effective,
+    list_profiles,
+    load_chain_file,
+    load_profile,
+    parse_chain,
+    stage,
+)
 
 GOOD = """
 [[chain]]

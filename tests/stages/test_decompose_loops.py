@@ -14,8 +14,7 @@ from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.kernels.fit import render
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
-from wavebatch.stages.chain import STAGES, Step
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import STAGES, Step, parse_chain
 from wavebatch.tools.simulate import Recording
 
 RECORDING = Recording(n_samples=64, bits=16, baseline=20.0, baseline_spread=0.0)

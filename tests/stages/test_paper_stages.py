@@ -11,8 +11,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import bound_time
-from wavebatch.stages.chain import STAGES, Step
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import STAGES, Step, parse_chain
 from wavebatch.stages.decompose.models import rebuild_waveforms
 
 SYSTEM = known_system(fine_recording(1.0, SIGMA))

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable, NoData, count_reasons
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.no_data import NoData, count_reasons
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, Radiometry, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import crlb
@@ -15,8 +14,7 @@ from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.kernels.physics.radiometry import receive_power
 from wavebatch.stages.attribute.radiometry import echo_light
-from wavebatch.stages.chain import STAGES, Chain, Solved, Step
-from wavebatch.stages.chain_file import load_profile, parse_chain
+from wavebatch.stages.chain import STAGES, Chain, Solved, Step, load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
 from wavebatch.surveying.flat_ground import SLOPE, predict_angles
 

@@ -13,8 +13,7 @@ import wavebatch as wb
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.waveforms import ReceiverNoise
 from wavebatch.stages import chain as chain_module
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import effective, load_plugins, parse_chain
+from wavebatch.stages.chain import STAGES, effective, load_plugins, parse_chain
 
 GOOD = '''
 from typing import Annotated

@@ -11,7 +11,7 @@ import wavebatch as wb
 from wavebatch import surveying
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import parse_chain
 from wavebatch.tools.compare_chains import measure_fit
 
 LEARNED = ((1.0, 0.0, 2.0), (0.3, 3.0, 2.4), (0.02, 9.0, 2.0))

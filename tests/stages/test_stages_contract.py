@@ -18,8 +18,7 @@ from contract_tools import (
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, ReturnTable, WaveformBlock
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import list_profiles, load_profile
+from wavebatch.stages.chain import STAGES, list_profiles, load_profile
 
 PROFILES = list_profiles()
 

@@ -10,7 +10,7 @@ from scoring import score
 
 import wavebatch
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.stages.chain_file import load_profile, parse_chain
+from wavebatch.stages.chain import load_profile, parse_chain
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.choose_chain import (
     LOST,

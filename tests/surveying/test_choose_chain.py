@@ -11,7 +11,7 @@ from commands import run_command
 from helpers_scenes import make_scene
 
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import parse_chain
 from wavebatch.surveying.choose_chain import COSTS, Request, make_choice, widest
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 

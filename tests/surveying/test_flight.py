@@ -12,7 +12,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.flight import hold_strip, read_samples, survey_flight
 from wavebatch.surveying.look import read_flight, surveys_agree
-from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey, parse_survey
 from wavebatch.tools.simulate import PulseModel, find_pulse, simulate_strip
 
 PULSE = find_pulse("riegl")

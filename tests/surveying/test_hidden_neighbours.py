@@ -10,7 +10,7 @@ from commands import run_command
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import load_profile
 from wavebatch.stages.decompose.merge import cover_hidden
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block

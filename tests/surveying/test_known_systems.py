@@ -15,7 +15,6 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.residuals import decompose_sample
-from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems import known_systems as module
 from wavebatch.surveying.systems.known_systems import (
     compare_pulses,
@@ -25,6 +24,7 @@ from wavebatch.surveying.systems.known_systems import (
     find_source,
     known_systems,
 )
+from wavebatch.surveying.systems.survey_result import load_survey
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 KNOWN = {one.name: one for one in known_systems()}

@@ -11,13 +11,12 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.surveying import Survey, survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring import choose_pulse
 from wavebatch.surveying.measuring.choose_pulse import settle
-from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey, parse_survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey, load_survey, parse_survey
 
 
 def flat_top(x):

@@ -18,8 +18,8 @@ from wavebatch.stages.attribute.radiometry import normalize_amplitude
 from wavebatch.surveying import Survey
 from wavebatch.surveying.matching.strip_energies import take_energies
 from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing
-from wavebatch.surveying.system_file import SavedSurvey, format_survey
 from wavebatch.surveying.systems.figures import Figures
+from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 

@@ -11,7 +11,7 @@ from scoring import score
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import load_profile
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import COSTS
 from wavebatch.surveying.predict_error import leave_out_false, predict_errors, simulate_again

@@ -10,7 +10,7 @@ import pytest
 from commands import run_command
 from footprints import Flight, Plane, match, roofs, write_strip
 
-from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems.survey_result import load_survey
 
 GREEN = Flight()
 HILLSIDE = Plane(slope=(np.tan(np.radians(22.0)), 0.1))

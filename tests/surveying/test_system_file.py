@@ -15,14 +15,14 @@ from wavebatch.core.waveforms import Defects, LevelWidths, Radiometry, ReceiverN
 from wavebatch.files.text_file import write_text
 from wavebatch.files.toml_file import list_entries, list_keys
 from wavebatch.surveying import Decision, Survey, survey_block
-from wavebatch.surveying.system_file import (
+from wavebatch.surveying.systems.figures import Figures, Kind, Level, Look, describe_system
+from wavebatch.surveying.systems.survey_result import (
     SYSTEM_SCHEMA,
     SavedSurvey,
     format_survey,
     load_survey,
     parse_survey,
 )
-from wavebatch.surveying.systems.figures import Figures, Kind, Level, Look, describe_system
 
 SYSTEM = SystemPulse(
     sigma_ref=1.8581162121217176,

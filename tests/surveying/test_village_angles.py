@@ -7,7 +7,7 @@ import pytest
 from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.stages.chain_file import parse_chain
+from wavebatch.stages.chain import parse_chain
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.tools.simulate import simulate_strip
 

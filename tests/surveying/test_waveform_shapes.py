@@ -10,8 +10,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Defects, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.defects import find_spikes
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
@@ -20,7 +19,7 @@ from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.measuring.joint_pulse import stack_jointly
 from wavebatch.surveying.measuring.judge import explain
 from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
-from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey, parse_survey
 
 BASE = 12.0
 

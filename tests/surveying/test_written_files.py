@@ -9,9 +9,9 @@ import pytest
 
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.report_file import _sum_up as sum_up
-from wavebatch.stages.chain_file import effective, load_chain_file
+from wavebatch.stages.chain import effective, load_chain_file
 from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration
-from wavebatch.surveying.system_file import format_survey, load_survey
+from wavebatch.surveying.systems.survey_result import format_survey, load_survey
 
 FOLDER = Path(__file__).parent / "written_files"
 """Written by commit 53e1b4c0 from simulated strips (stiff, village, a flight of three), and two with every key."""

@@ -32,8 +32,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.fit.closed_form import crlb
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import accuracy, command
 from wavebatch.tools.sheets.sheet import list_lines

@@ -12,7 +12,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
-from wavebatch.surveying.system_file import SavedSurvey, format_survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey
 from wavebatch.tools.raster import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 

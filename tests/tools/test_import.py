@@ -12,7 +12,7 @@ from pulse_files import Pulse, PulseFile, Sampling, bell
 import wavebatch as wb
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems.survey_result import load_survey
 from wavebatch.tools.import_file import ImportOptions, import_file, project_utm
 
 SENT, ECHO = Sampling(kind=1, channel=3, scale=0.01), Sampling(scale=0.5, duration_bits=32)

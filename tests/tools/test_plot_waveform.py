@@ -20,8 +20,7 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import PulseShape
-from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile, parse_chain
+from wavebatch.stages.chain import STAGES, load_profile, parse_chain
 from wavebatch.surveying import survey_block
 from wavebatch.tools.compare_chains import ChainRun, measure_fit
 from wavebatch.tools.plots import waveform

@@ -9,7 +9,7 @@ from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import Survey
-from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.survey_result import SavedSurvey
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 NOISE = ReceiverNoise(baseline=12.0, baseline_spread=0.1, std=0.58)

@@ -20,7 +20,7 @@ from wavebatch.kernels.physics.radiometry import backscatter, compute_cross_sect
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.sensor import SensorRequest
-from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.survey_result import SavedSurvey
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import FlightLine, Recording, find_pulse
 from wavebatch.tools.simulate.scenes import simulate_block

@@ -94,7 +94,7 @@ class RunReport:
     flags: Mapping[str, int] = field(default_factory=dict)
     """Points written per flag."""
     no_data: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    """Echoes per column that can lack values and per reason in no_data.NoData; KNOWN counts those with a value."""
+    """Echoes per column that can lack values and per reason of NoData; KNOWN counts those with a value."""
     above_one: int = 0
     """Echoes that reflect more than a white matt surface, level or facing the sensor."""
     last_left_out: int = 0

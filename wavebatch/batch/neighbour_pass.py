@@ -25,10 +25,9 @@ import numpy as np
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import spread
 from wavebatch.batch.unit import Prepared, UnitResult, finish_rows, solve_unit, unpack
-from wavebatch.core.echoes import COLUMNS, EchoTable
+from wavebatch.core.echoes import COLUMNS, SUFFIX, EchoTable, NoData, count_reasons
 from wavebatch.core.errors import StageError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, STORE_PIECE, RowStore, Spool
 from wavebatch.files.las.header import field_names

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from wavebatch.batch.counts import RunReport, count_flags
-from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable
+from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable, count_reasons
 from wavebatch.core.errors import StageError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.no_data import count_reasons
 from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock

@@ -21,19 +21,18 @@ from wavebatch import __version__
 from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
 from wavebatch.batch.job import StripJob, split_columns
 from wavebatch.batch.unit import Prepared
-from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.echoes import REASONS, EchoFlag, NoData, without_nan
 from wavebatch.core.errors import StripWarning
-from wavebatch.core.no_data import REASONS, NoData, without_nan
 from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.files.disk.raw_bytes import take_fingerprint
-from wavebatch.stages.chain_file import effective
+from wavebatch.stages.chain import effective
 from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets, name_gains
-from wavebatch.surveying.system_file import format_survey
 from wavebatch.surveying.systems.known_systems import doubt_survey
+from wavebatch.surveying.systems.survey_result import format_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 MOST_REPORT = 64 << 20

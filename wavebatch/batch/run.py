@@ -33,8 +33,7 @@ from wavebatch.files.disk.publish import protecting, refuse_input, remove_stale,
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.library import load as load_kernels
 from wavebatch.surveying.look import read_flight, surveys_agree
-from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey, parse_survey
-from wavebatch.surveying.systems.survey_result import Survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, Survey, format_survey, load_survey, parse_survey
 
 if TYPE_CHECKING:
     from wavebatch.batch.workers.dask_cluster import Cluster

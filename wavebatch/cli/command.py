@@ -240,7 +240,7 @@ def complete_files(context: click.Context, parameter: click.Parameter, incomplet
 
 def complete_profiles(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the shipped chains and auto."""
-    from wavebatch.stages.chain_file import list_profiles
+    from wavebatch.stages.chain import list_profiles
 
     return [name for name in ("auto", *list_profiles()) if name.startswith(incomplete)]
 
@@ -273,8 +273,7 @@ def complete_columns(context: click.Context, parameter: click.Parameter, incompl
 
 def complete_stages(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the names of stages, those of other packages too."""
-    from wavebatch.stages.chain import STAGES
-    from wavebatch.stages.chain_file import load_plugins
+    from wavebatch.stages.chain import STAGES, load_plugins
 
     load_plugins()
     return sorted(name for name in STAGES if name.startswith(incomplete))

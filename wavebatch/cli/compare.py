@@ -86,7 +86,7 @@ def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **
     if strip:
         from wavebatch.core.errors import nearest
         from wavebatch.surveying.choose_chain import COSTS
-        from wavebatch.surveying.system_file import load_survey
+        from wavebatch.surveying.systems.survey_result import load_survey
         from wavebatch.tools.api import AUTO
         from wavebatch.tools.compare_chains import find_contender, match_sides
 

@@ -223,7 +223,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     from wavebatch.batch.options import RunOptions
     from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.surveying.calibrating.calibration_files import load_calibration
-    from wavebatch.surveying.system_file import load_survey
+    from wavebatch.surveying.systems.survey_result import load_survey
     from wavebatch.tools.api import read_sensor
 
     for name in ("trajectory", "lever_arm", "crs", "flight_height"):

@@ -229,8 +229,7 @@ def stages(name: str | None, **options: Any) -> None:
       wavebatch stages decompose.adaptive
     """
     from wavebatch.core.echoes import COLUMNS
-    from wavebatch.stages.chain import KINDS, STAGES
-    from wavebatch.stages.chain_file import load_plugins
+    from wavebatch.stages.chain import KINDS, STAGES, load_plugins
 
     for line in load_plugins() if name not in STAGES else ():
         talk(f"warning: {line}")
@@ -274,8 +273,7 @@ def _types(parameter: Parameter) -> str:
 
 def _describe(stage: Stage) -> dict[str, Any]:
     """The document of a stage for --json."""
-    from wavebatch.stages.chain import Step
-    from wavebatch.stages.chain_file import format_step
+    from wavebatch.stages.chain import Step, format_step
 
     parameters = {
         name: {"type": _types(one), "default": one.default, "range": one.range, "meaning": one.meaning}

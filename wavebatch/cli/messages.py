@@ -269,7 +269,7 @@ def print_text(text: str) -> None:
 
 def format_json(value: Any) -> str:
     """Plain values as JSON text with sorted keys; NaN becomes null."""
-    from wavebatch.core.no_data import without_nan
+    from wavebatch.core.echoes import without_nan
 
     text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
     return text.encode(errors="backslashreplace").decode()

@@ -57,7 +57,7 @@ class Progress(Closing):
 
     def show(self, event: dict[str, Any]) -> None:
         """Shows one event of `run_batch`."""
-        from wavebatch.core.no_data import REASONS, NoData
+        from wavebatch.core.echoes import REASONS, NoData
 
         error = event.get("error")
         if self._json:
@@ -336,7 +336,7 @@ def find_exit_code(errors: Sequence[BaseException | None]) -> int:
 
 def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     from wavebatch.batch.run import plan_strip
-    from wavebatch.stages.chain_file import effective
+    from wavebatch.stages.chain import effective
 
     errors: list[BaseException | None] = []
     plans, as_json = [], options["as_json"]

@@ -22,7 +22,7 @@ from wavebatch.files.text_file import write_text
 from wavebatch.tools.sheets.sheet import Sheet
 
 if TYPE_CHECKING:
-    from wavebatch.surveying.system_file import SavedSurvey
+    from wavebatch.surveying.systems.survey_result import SavedSurvey
 
 EXIT_PROBLEMS = 1
 """A strip cannot be surveyed, or does not belong to the others."""
@@ -64,9 +64,9 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
     """  # fmt: skip
     from wavebatch.files.figure_file import check_picture
     from wavebatch.surveying.choose_chain import chain_text
-    from wavebatch.surveying.system_file import SYSTEM_SCHEMA, format_survey
     from wavebatch.surveying.systems.figures import describe_figures, describe_system
     from wavebatch.surveying.systems.known_systems import doubt_survey, find_likeness, find_source
+    from wavebatch.surveying.systems.survey_result import SYSTEM_SCHEMA, format_survey
     from wavebatch.tools.sheets.survey import list_doubts, survey_page, survey_sheet
 
     angles, html_file, overwrite = options["angles"], options["html_file"], options["overwrite"]
@@ -123,7 +123,7 @@ def _survey(strip: Path, options: dict[str, Any], *, keeps: bool) -> tuple[Saved
     """The survey, and what else is shown of the strip; keeps: all of its figures are, not only printed ones."""
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
-    from wavebatch.surveying.system_file import SavedSurvey
+    from wavebatch.surveying.systems.survey_result import SavedSurvey
     from wavebatch.tools import api
 
     with api.open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:

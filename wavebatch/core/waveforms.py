@@ -5,7 +5,7 @@ never write into them. The meaning, dtype and unit of a field stand below it, an
 
 The parts of a SystemPulse beside the pulse come first: noise and defects of the receiver and the widths of level
 ground, which the survey measures, and the light, which `surveying.calibration` and options of a run give. Fields with a
-Key stand in system files (`surveying/system_file.py`).
+Key stand in system files (`surveying/systems/survey_result.py`).
 """
 
 from __future__ import annotations
@@ -397,7 +397,7 @@ _Gaussian = tuple[Annotated[float, Range(-10.0, 10.0)], Annotated[float, Range(-
 class SystemPulse:
     """What the survey found out about sensor and scene of a strip: the same for every block of one digitizer.
 
-    A field with a Key stands in system files, in this order: `surveying/system_file.py` writes and reads them.
+    A field with a Key stands in system files, in this order: `systems/survey_result.py` writes and reads them.
     """
 
     sigma_ref: Annotated[

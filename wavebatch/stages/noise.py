@@ -13,8 +13,7 @@ from wavebatch.core.units import MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import quiet_levels
-from wavebatch.kernels.signal.floor import MOST_CUT, MOST_LEAST, floor_response, floor_share
-from wavebatch.kernels.signal.noise import DRIFT, find_levels
+from wavebatch.kernels.signal.noise import DRIFT, MOST_CUT, MOST_LEAST, find_levels, floor_response, floor_share
 from wavebatch.kernels.signal.runs import find_stretches, list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, quiet_mean, sum_samples, transpose_samples
 from wavebatch.stages.chain import Range, stage

@@ -21,12 +21,10 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.stages.chain import Chain
-from wavebatch.stages.chain_file import format_step, load_profile, parse_chain
+from wavebatch.stages.chain import Chain, format_step, load_profile, parse_chain
 from wavebatch.surveying.look import join_digitizers
-from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.figures import describe_figures, describe_system
-from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
+from wavebatch.surveying.systems.survey_result import Decision, Part, SavedSurvey, Survey
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from wavebatch.core.echoes import REASONS, NoData
 from wavebatch.core.frozen import frozen
-from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.order import even_places
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import LevelWidths, SystemPulse, WaveformBlock

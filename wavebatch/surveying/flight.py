@@ -27,9 +27,9 @@ from wavebatch.surveying.inspect_strip import doubt_files
 from wavebatch.surveying.look import Glance, compare_echoes, compare_looks, glance_at, kind_of, look_at, read_flight
 from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH
 from wavebatch.surveying.survey import survey_blocks
-from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.figures import Kind, Look
 from wavebatch.surveying.systems.saved_check import HELD
+from wavebatch.surveying.systems.survey_result import SavedSurvey
 
 LEAST_SHARE = 64
 """Waveforms that each strip gives to the survey, however many strips there are."""

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.echoes import without_nan
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.frozen import frozen
-from wavebatch.core.no_data import without_nan
 from wavebatch.files.las.header import LasHeader, read_header
 from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
@@ -71,7 +71,7 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
     """
     path = Path(path)
     if path.suffix.lower() == ".toml":
-        from wavebatch.stages.chain_file import load_chain_file  # stages and survey: half of the start of `info`
+        from wavebatch.stages.chain import load_chain_file  # stages and survey: half of the start of `info`
 
         try:
             chain = load_chain_file(path)
@@ -196,7 +196,7 @@ def _match_returns(reader: StripReader, scan: StripScan) -> tuple[int, int]:
     blocks = list(reader.sample_blocks(scan, _MATCHED)) if scan.with_waveform else []
     if not blocks:
         return 0, 0
-    from wavebatch.stages.chain_file import load_profile
+    from wavebatch.stages.chain import load_profile
     from wavebatch.surveying.survey import survey_blocks
 
     system, chain = survey_blocks(blocks, learn=False).system, load_profile("accurate")

@@ -18,9 +18,8 @@ from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, stack_pulse
 from wavebatch.kernels.signal.outgoing import OutgoingReference, measure_outgoing
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
-from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.surveying.systems.figures import Figures
-from wavebatch.surveying.systems.survey_result import Decision, Survey
+from wavebatch.surveying.systems.survey_result import Decision, SavedSurvey, Survey, load_survey
 
 STACKED = 4096
 """Outgoing pulses that are stacked, at most."""

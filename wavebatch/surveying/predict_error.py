@@ -13,9 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable, without_nan
 from wavebatch.core.frozen import frozen
-from wavebatch.core.no_data import without_nan
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import bound_time

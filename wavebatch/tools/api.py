@@ -28,17 +28,14 @@ from wavebatch.files.strip.scanner import StripScan
 from wavebatch.files.text_file import find_strips
 from wavebatch.files.trajectory_file import check_trajectory
 from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
-from wavebatch.stages import chain_file
-from wavebatch.stages.chain import Chain
-from wavebatch.stages.chain_file import list_profiles
+from wavebatch.stages.chain import Chain, list_profiles, load_chain_file, load_profile
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
 from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, choose_chain, decide, read_sample, widest
 from wavebatch.surveying.flat_ground import survey_angles
 from wavebatch.surveying.sensor import SensorRequest
-from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.surveying.systems.saved_check import with_look
-from wavebatch.surveying.systems.survey_result import Survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, Survey, load_survey
 
 AUTO = "auto"
 """In place of a chain's name: the survey of each strip chooses the chain."""
@@ -63,12 +60,12 @@ def load_chain(name: Path | str) -> Chain:
     ConfigError
         Where there is no such chain or it is wrong; names file, table, key and the nearest known word.
     """
-    known = chain_file.list_profiles()
+    known = list_profiles()
     if isinstance(name, Path) or Path(name).name != name or Path(name).suffix:
-        return chain_file.load_chain_file(name)
+        return load_chain_file(name)
     if name not in known:
         raise ConfigError(f"profile {name!r} does not exist; {nearest(name, [AUTO, *known])}")
-    return chain_file.load_profile(name)
+    return load_profile(name)
 
 
 def auto_chain(survey: Survey) -> Chain:

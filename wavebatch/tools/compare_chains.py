@@ -20,14 +20,12 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.packets import MAX_SAMPLES
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.stages.chain import STAGES, Chain, Solved, Step
-from wavebatch.stages.chain_file import list_profiles
+from wavebatch.stages.chain import STAGES, Chain, Solved, Step, list_profiles
 from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level, floor_level
 from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
-from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.surveying.systems.survey_result import Survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, Survey
 from wavebatch.tools import pairing
 from wavebatch.tools.api import AUTO, load_chain
 

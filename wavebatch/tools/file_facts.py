@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
+from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag, without_nan
 from wavebatch.core.errors import InputError
-from wavebatch.core.no_data import without_nan
 from wavebatch.core.units import ADJUSTED, WEEK, date_gps
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.column_names import read_provenance

@@ -40,7 +40,7 @@ from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference,
 from wavebatch.kernels.signal.signal import find_peaks, smooth_121, transpose_samples
 from wavebatch.surveying.measuring.noise_and_width import find_saturation
 from wavebatch.surveying.outgoing import STACKED, SYSTEM_SUFFIX, OutgoingShape, learn_shape, save_outgoing
-from wavebatch.surveying.system_file import format_survey
+from wavebatch.surveying.systems.survey_result import format_survey
 
 SUFFIXES = (".pls",)
 USER_ID = b"wavebatch_import"

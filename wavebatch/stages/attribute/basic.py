@@ -12,9 +12,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import SUFFIX, EchoFlag, EchoTable, NoData, explain_no_data
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, LEAST_PULSE_WIDTH, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, residual_moments

@@ -22,8 +22,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
+from wavebatch.core.echoes import SUFFIX, EchoFlag, EchoTable, NoData, explain_no_data
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
 from wavebatch.kernels.elementary import exp, log

@@ -17,8 +17,7 @@ from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import render_pulses
 from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
-from wavebatch.kernels.signal.floor import MOST_LEAST, floor_share
-from wavebatch.kernels.signal.noise import DRIFT, residual_noise
+from wavebatch.kernels.signal.noise import DRIFT, MOST_LEAST, floor_share, residual_noise
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import matched_filter

@@ -1,10 +1,10 @@
 """The tables [figures] and [system] of a SYSTEM.toml: what a survey measured, and the system pulse as plain numbers.
 
 Figures: echoes and pulse models, the scene, and what strips of the flight record. `survey` fills them in, decisions and
-reports are made from them, and `system_file` keeps them. A field whose Key says how it is `shown` is a line of
+reports are made from them, and `survey_result` keeps them. A field whose Key says how it is `shown` is a line of
 `wavebatch survey` too. Files of earlier versions lack figures and have others, so each may be missing.
 
-System: `system_file` writes and reads whole files with it, `known_systems` the pulses that are shipped. Keys, ranges
+System: `survey_result` writes and reads whole files with it, `known_systems` the pulses that are shipped. Keys, ranges
 and comments are those of the fields of SystemPulse. Before you change it: every number must come back to the last bit.
 """
 

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN, EchoTable
+from wavebatch.core.echoes import UNCLEAN, EchoTable, without_nan
 from wavebatch.core.frozen import frozen
-from wavebatch.core.no_data import without_nan
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.runs import lobe_edges

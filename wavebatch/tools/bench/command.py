@@ -53,8 +53,7 @@ from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import expand
 from wavebatch.files.text_file import write_text
-from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.stages.chain_file import effective, load_chain_file, load_profile
+from wavebatch.stages.chain import STAGES, Chain, Step, effective, load_chain_file, load_profile
 from wavebatch.stages.score import QUANTITIES
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import SAMPLE, choose_chain

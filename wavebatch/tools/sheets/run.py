@@ -20,13 +20,12 @@ from wavebatch import __version__
 from wavebatch.batch.counts import COUNTS, LEFT_OUT, list_sums
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.run import BatchResult, Outcome
-from wavebatch.core.echoes import FLAG_MEANINGS, EchoFlag
+from wavebatch.core.echoes import FLAG_MEANINGS, REASONS, EchoFlag, NoData
 from wavebatch.core.frozen import frozen
-from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.order import robust_std
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.toml_file import format_toml
-from wavebatch.surveying.system_file import SYSTEM_SCHEMA, parse_survey
+from wavebatch.surveying.systems.survey_result import SYSTEM_SCHEMA, parse_survey
 from wavebatch.tools.plots.charts import figures_of, picture_cloud
 from wavebatch.tools.sheets.page import write_page
 from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Sheet, Table, sum_table

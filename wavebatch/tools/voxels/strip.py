@@ -39,8 +39,8 @@ from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.inspect_strip import name_gains
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
-from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.figures import describe_system
+from wavebatch.surveying.systems.survey_result import SavedSurvey
 from wavebatch.tools.voxels import grid as voxel_grid
 from wavebatch.tools.voxels import rays
 
