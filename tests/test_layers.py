@@ -28,7 +28,7 @@ INSIDE = {
     ],
     "surveying": [
         {"measuring"}, {"look", "predict_error"}, {"survey", "sensor"}, {"outgoing"},
-        {"choose_chain", "inspect_strip", "calibration"}, {"flat_ground", "flight"}, {"prepare"},
+        {"choose_chain", "calibration"}, {"flat_ground"}, {"inspect_strip"}, {"flight"}, {"prepare"},
     ],
 }
 """The same within packages whose modules do one thing after another."""

@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
     from wavebatch.files.cloud.cloud_reader import read_cloud
     from wavebatch.stages.chain import Chain, Range, Step, stage
+    from wavebatch.surveying.inspect_strip import Strip, open_strip, survey
     from wavebatch.surveying.systems.survey_result import Decision, Survey
-    from wavebatch.tools.api import Strip, auto_chain, load_chain, open_strip, run, survey
+    from wavebatch.tools.api import auto_chain, load_chain, run
 
 __version__ = "0.1.0"
 
@@ -40,7 +41,8 @@ _MODULES = {
     "stages.chain": ("Chain", "Range", "Step", "stage"),
     "batch.options": ("RunOptions",),
     "surveying.systems.survey_result": ("Decision", "Survey"),
-    "tools.api": ("Strip", "auto_chain", "load_chain", "open_strip", "run", "survey"),
+    "surveying.inspect_strip": ("Strip", "open_strip", "survey"),
+    "tools.api": ("auto_chain", "load_chain", "run"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -149,7 +149,7 @@ SURVEYS = "wavebatch.surveying.survey wavebatch.surveying.flight wavebatch.surve
     [
         ("info STRIP", "laspy scipy wavebatch.stages wavebatch.surveying.survey"),
         ("run STRIP -o OUT --system SYSTEM", f"{SURVEYS} laspy pyproj requests urllib3 numpy.ma scipy dask {PAGES}"),
-        ("survey STRIP", f"laspy pyproj scipy {PAGES}"),
+        ("survey STRIP", f"wavebatch.batch.run laspy pyproj numpy.ma scipy {PAGES}"),
     ],
 )
 def test_commands_import_only_what_they_use(tmp_path, tiny_strip, command, unused):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.core.order import distinct, find_order, group_medians, known_median, median, quantile
+from wavebatch.core.order import distinct, find_order, group_medians, known_median, median, quantile, quantiles
 
 
 def test_any_rows_get_the_order_of_a_full_sort(rng):
@@ -38,7 +38,7 @@ def test_medians_of_groups_are_those_of_each_group_alone():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int64, np.uint8])
-@pytest.mark.parametrize("n", [1, 2, 3, 10, 11, 1000])
+@pytest.mark.parametrize("n", [1, 2, 3, 10, 11, 1000, 70_001])
 def test_distinct_median_and_quantile_give_the_bits_of_numpy(dtype, n, rng):
     values = (rng.normal(0, 40, n) + 100).astype(dtype)
     table = (rng.normal(0, 40, (n, 6)) + 100).astype(dtype)
@@ -48,8 +48,11 @@ def test_distinct_median_and_quantile_give_the_bits_of_numpy(dtype, n, rng):
         assert np.asarray(found).dtype == np.asarray(expected).dtype
         np.testing.assert_array_equal(found, expected)
     if np.issubdtype(dtype, np.floating):
-        for share in (0.0, 0.1, 0.25, 0.5, 0.84, 1.0):
+        for share in (0.0, 0.1, 0.25, 0.5, 0.84, 0.99, 1.0):
             assert quantile(values, share) == float(np.quantile(values, share))
+        for given in (values, table):
+            found, shares = quantiles(given, (0.0, 0.02, 0.5, 0.8413, 1.0)), (0.0, 0.02, 0.5, 0.8413, 1.0)
+            np.testing.assert_array_equal(found, np.quantile(given, shares, axis=-1), strict=True)
 
 
 def test_the_median_of_nan_or_of_nothing_is_nan():

@@ -169,3 +169,10 @@ def test_pulses_are_compared_by_shape_alone():
     assert compare_pulses(b, a) == pytest.approx(compare_pulses(a, b))
     assert find_likeness(SystemPulse(sigma_ref=pulse.sigma_ref), 1.0) is None, "any Gaussian of its width"
     assert find_likeness(pulse, 0.5) is None and find_likeness(pulse, 1.0).difference < 1e-6
+
+
+@pytest.mark.parametrize("known", KNOWN.values(), ids=lambda one: one.name)
+def test_shipped_files_say_how_unlike_a_gaussian_their_pulse_is(known):
+    widths = known.system.sigma_ref * np.linspace(0.7, 1.5, 21)
+    nearest = min(compare_pulses(known.system, SystemPulse(sigma_ref=float(width))) for width in widths)
+    assert known.unlike_gaussian == pytest.approx(nearest, abs=1e-6)

@@ -60,8 +60,8 @@ def info(strips: tuple[str, ...], direction: str, headerless: bool, **options: A
         facts = describe_file(path, direction=direction, headerless=headerless)
         if options["verbose"] and facts.get("packets", {}).get("count") and not facts["problems"]:
             from wavebatch.core.units import FWHM_PER_SIGMA
+            from wavebatch.surveying.inspect_strip import open_strip, survey
             from wavebatch.surveying.systems.known_systems import find_likeness
-            from wavebatch.tools.api import open_strip, survey
 
             with open_strip(path, direction=direction, headerless=headerless) as strip:
                 found = survey(strip)

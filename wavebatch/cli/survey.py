@@ -122,12 +122,11 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
 def _survey(strip: Path, options: dict[str, Any], *, keeps: bool) -> tuple[SavedSurvey, dict[str, Any]]:
     """The survey, and what else is shown of the strip; keeps: all of its figures are, not only printed ones."""
     from wavebatch.files.disk.raw_bytes import take_fingerprint
-    from wavebatch.surveying.inspect_strip import doubt_files
+    from wavebatch.surveying import inspect_strip
     from wavebatch.surveying.systems.survey_result import SavedSurvey
-    from wavebatch.tools import api
 
-    with api.open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
-        found = api.survey(
+    with inspect_strip.open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
+        found = inspect_strip.survey(
             opened, waveforms=options["waveforms"], divergence=options["divergence"], find_divergence=True,
             for_checks=keeps,
         )  # fmt: skip
@@ -137,7 +136,7 @@ def _survey(strip: Path, options: dict[str, Any], *, keeps: bool) -> tuple[Saved
             "points": scan.points,
             "packets": scan.packets,
             "direction": {"sign": scan.vectors.direction, "evidence": scan.vectors.evidence},
-            "warnings": [asdict(one) for one in doubt_files(opened.facts, scan)],
+            "warnings": [asdict(one) for one in inspect_strip.doubt_files(opened.facts, scan)],
         }
         packet_file = opened.facts.packets.file
         if options["angles"] is not None:

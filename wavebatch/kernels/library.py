@@ -16,6 +16,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.kernels.build_kernels import LIBRARY, SOURCES, compile_library, is_outdated, is_whole
 
 _POINTER = ctypes.c_void_p
+_BYTE: Any = ctypes.c_char.from_buffer  # of an array
 
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "filter_rows", "find_maxima", "group_candidates",
@@ -327,8 +328,10 @@ def call(name: str, *arguments: Any) -> int:
         There is not enough for its largest waveform or window.
     """
     given = [
-        ctypes.c_void_p(address(part)) if isinstance(part, np.ndarray)
-        else ctypes.byref(part) if isinstance(part, ctypes.Structure) else part
+        part if not isinstance(part, np.ndarray | ctypes.Structure)
+        else ctypes.byref(part) if isinstance(part, ctypes.Structure)
+        else ctypes.byref(_BYTE(part)) if part.size and part.flags.carray  # a survey calls 3,000 times
+        else ctypes.c_void_p(part.ctypes.data)
         for part in arguments
     ]  # fmt: skip
     result = getattr(load(), name)(*given)
@@ -347,5 +350,5 @@ def place(array: np.ndarray, dtype: type) -> int:
 def address(array: np.ndarray) -> int:
     """Address of an array's first value; `array.ctypes.data` takes twice as long, and a survey asks 10,000 times."""
     if array.size and array.flags.carray:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
+        return ctypes.addressof(_BYTE(array))
     return array.ctypes.data  # of what cannot be written, or is empty

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wavebatch.core.order import median, quantiles
 from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
@@ -86,7 +87,7 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
         x = np.arange(len(signal), dtype=np.float32) - np.float32(0.5 * (len(signal) - 1))
         signal -= x[:, None] * slope.astype(np.float32)
     if defects.spikes > 0:
-        level = np.median(signal, axis=0) if defects.slope_spread > 0 else np.float32(system.noise.baseline)
+        level = median(signal, axis=0) if defects.slope_spread > 0 else np.float32(system.noise.baseline)
         fill_spikes(signal, find_spikes(signal - level, system.noise.quiet, system.sigma_ref / block.spacing))
     clipped = (raw >= clip_level(block, system)) | (raw <= floor_level(system))
     np.copyto(signal, raw, where=clipped)
@@ -150,7 +151,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
         # Everything else is measured about level baselines.
         defects = Defects(slope_spread=spread / block.spacing)
         signal = clean_block(block, replace(system, defects=defects)).samples.T
-        level = np.median(signal, axis=0)
+        level = median(signal, axis=0)
     elif system.noise.baseline_spread > DRIFT * std:
         level = find_levels(signal, std, reach)[0]
     else:
@@ -192,8 +193,8 @@ def _slope_spread(
     share = np.mean(np.abs(slope) > STEEP * error)
     if min(np.mean(slope > STEEP * error), np.mean(slope < -STEEP * error)) < RARER * share:
         return 0.0
-    low, middle, high = np.quantile(slope, [0.1587, 0.5, 0.8413])
-    excess = max(0.25 * (high - low) ** 2 + middle**2 - np.median(error) ** 2, 0.0)
+    low, middle, high = quantiles(slope, [0.1587, 0.5, 0.8413])
+    excess = max(0.25 * (high - low) ** 2 + middle**2 - median(error) ** 2, 0.0)
     few = np.mean(slope**2) if share < 0.3 else 0.0
-    spread = float(np.sqrt(max(excess, few - np.median(error) ** 2)))
+    spread = float(np.sqrt(max(excess, few - median(error) ** 2)))
     return spread if share > SLOPES and spread * 0.5 * len(signal) > LEAST_RISE * std else 0.0

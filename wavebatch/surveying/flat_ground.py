@@ -23,7 +23,7 @@ import numpy as np
 
 from wavebatch.core.echoes import REASONS, NoData
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import even_places
+from wavebatch.core.order import even_places, median, quantile
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import locate
@@ -159,7 +159,7 @@ def measure_slope(reader: StripReader, scan: StripScan) -> float:
         radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR,
     )  # fmt: skip
     known = slope[np.isfinite(slope)]
-    return float(np.quantile(known, 0.84)) if len(known) >= ENOUGH_TO_LEARN else 0.0
+    return quantile(known, 0.84) if len(known) >= ENOUGH_TO_LEARN else 0.0
 
 
 def _read_middle(reader: StripReader, scan: StripScan) -> np.ndarray:
@@ -200,7 +200,7 @@ def _choose_radius(xyz: np.ndarray) -> float:
         near = np.bincount(point, minlength=len(some)) >= number
         distance = np.full(len(some), 1e9)
         distance[near] = np.sqrt(square[last[near]])
-        needed = float(np.quantile(distance, 0.9))
+        needed = quantile(distance, 0.9)
     radius = float(np.clip(np.ceil(10.0 * needed) / 10.0, *RADII))
     while radius < RADII[1]:
         # Points whose neighbours lie on two scan lines, seen from above, have no angle.
@@ -300,7 +300,7 @@ def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
     hold = max(len(ordered) // 3, 2)
     span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
     first = int(np.argmin(span))
-    level, level_err = float(np.median(ordered[first : first + hold])), float(np.median(error))
+    level, level_err = float(median(ordered[first : first + hold])), float(median(error))
     for _ in range(ROUNDS):
         near = np.abs(variance - level) < 2.0 * error
         if np.count_nonzero(near) < ENOUGH_TO_LEARN:
@@ -310,10 +310,10 @@ def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
         level_err = float(weight.sum() ** -0.5)
     level = min(level, 0.0)
     below = variance < level
-    ratio = np.median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
-    excess = np.median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
+    ratio = median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
+    excess = median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
     scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
-    level_err = float(np.hypot(level_err, 2.0 * square * np.median(lever) * system.radiometry.divergence_error))
+    level_err = float(np.hypot(level_err, 2.0 * square * median(lever) * system.radiometry.divergence_error))
     return replace(system, widths=LevelWidths(level, level_err, scatter))
 
 
@@ -344,7 +344,7 @@ def _fit_divergence(
     if len(variance) < GROUPS * ENOUGH_TO_LEARN // 2:
         return None, 0.0
     groups = np.array_split(np.argsort(lever, kind="stable"), GROUPS)
-    middle = np.array([(np.median(lever[rows]), np.median(variance[rows])) for rows in groups])
+    middle = np.array([(median(lever[rows]), median(variance[rows])) for rows in groups])
     off = middle - middle.mean(axis=0)
     square = float((off[:, 0] * off[:, 1]).sum() / max((off[:, 0] ** 2).sum(), 1e-300))
     level = float(middle[:, 1].mean() - square * middle[:, 0].mean())
@@ -352,7 +352,7 @@ def _fit_divergence(
         total = np.hypot(error, max(square, 0.0) * lever_err)
         left = variance - level - square * lever
         # Rough surfaces and plants only widen echoes, so that the scatter is that of the lower half.
-        scatter = np.sqrt(np.median((left[left < 0] / total[left < 0]) ** 2) / SQUARED_NORMAL_MEDIAN)
+        scatter = np.sqrt(median((left[left < 0] / total[left < 0]) ** 2) / SQUARED_NORMAL_MEDIAN)
         total = total * max(scatter, 1.0) if np.isfinite(scatter) else total
         near = np.abs(left) < 2.5 * total
         weight = np.where(near, total**-2.0, 0.0)

@@ -1,13 +1,15 @@
-"""The problems of a strip or a chain file, for `wavebatch check`; what a sample of its packets shows, for `info` too.
+"""A strip as users open and survey it; its problems, for `wavebatch check`; what its packets show, for `info` too.
 
+`Strip`, `open_strip` and `survey` are names of the public API: commands that only survey import no part of a run.
 `check` compares the header's claims with the points, which wavebatch itself does not use. Before you change it: an
 error in a file is a finding here, never an exception.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,16 @@ import numpy as np
 from wavebatch.core.echoes import without_nan
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.frozen import frozen
+from wavebatch.core.waveforms import Digitizer, WaveformBlock
+from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.las.header import LasHeader, read_header
 from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
 from wavebatch.files.strip.scanner import describe_oddities
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from wavebatch.surveying.systems.survey_result import Survey
 
 _SAMPLED = 4096
 """Waveforms of which extremes are read."""
@@ -207,3 +215,175 @@ def _match_returns(reader: StripReader, scan: StripScan) -> tuple[int, int]:
             matched += int(np.count_nonzero(echoes.attributes["point"] >= 0))
             returns += int(np.count_nonzero(np.isin(block.returns.waveform, echoes.waveform)))
     return matched, returns
+
+
+BLOCK_SIZE = 16_384
+"""Waveforms of a block by default: above some 4,000 the speed hardly changes, memory does (80 samples: about 10 MB)."""
+
+
+class Strip(Closing):
+    """An open full-waveform strip. A context manager; make one with `open_strip`.
+
+    `len(strip)` is the number of waveforms, each counted once however many points share it. The first use of `len`,
+    `scan` or `blocks` reads all point records once.
+
+    Attributes
+    ----------
+    reader : StripReader
+        Reads points and packets unit by unit.
+    """
+
+    def __init__(self, reader: StripReader) -> None:
+        self.reader = reader
+        self._scan: StripScan | None = None
+
+    def __len__(self) -> int:
+        """Return the number of waveforms."""
+        return self.scan.packets
+
+    def __repr__(self) -> str:
+        """Return path and number of points."""
+        return f"<Strip {self.facts.path}: {self.facts.header.point_count} points>"
+
+    @property
+    def facts(self) -> StripFacts:
+        """What the headers say: path, point format, point count, scales, offsets, digitizers, ..."""
+        return self.reader.facts
+
+    @property
+    def digitizers(self) -> Mapping[int, Digitizer]:
+        """How samples were made, by the index of the wave packet descriptor."""
+        return self.reader.facts.digitizers
+
+    @property
+    def crs(self) -> str | None:
+        """Coordinate reference system as the file has it (WKT or GeoTIFF keys as text); None without one."""
+        return self.reader.facts.crs
+
+    @property
+    def scan(self) -> StripScan:
+        """Result of one pass over all point records, made on first use.
+
+        Raises
+        ------
+        InputError
+            Where the strip cannot be processed: no packet can be read, vectors point nowhere, ...
+        """
+        if self._scan is None:
+            self._scan = self.reader.scan()
+        return self._scan
+
+    def blocks(self, size: int | None = None) -> Iterator[WaveformBlock]:
+        """Every waveform of the strip once, in blocks of one digitizer and one length.
+
+        Parameters
+        ----------
+        size : int, optional
+            Most waveforms of a block; 16384 by default. The echoes do not depend on it.
+
+        Yields
+        ------
+        WaveformBlock
+            n waveforms of s samples, in the order of the file within each digitizer.
+        """
+        if size is not None and size < 1:
+            raise ValueError(f"size must be at least 1, got {size}")
+        yield from self.reader.all_blocks(self.scan, size or BLOCK_SIZE)
+
+    def close(self) -> None:
+        """Close the files and remove temporary ones. Harmless twice."""
+        if self._scan is not None:
+            self._scan.close()
+            self._scan = None
+        self.reader.close()
+
+
+def open_strip(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> Strip:
+    """Open a LAS or LAZ strip with waveforms; only headers are read.
+
+    Parameters
+    ----------
+    path : path or str
+        File of point format 4, 5, 9 or 10; external packets lie in a .wdp file of the same name.
+    direction : {"auto", "toward", "away"}
+        Where packet vectors point, seen from the target; "auto" lets the file decide.
+    headerless : bool
+        Accept a .wdp file without its 60-byte header.
+
+    Returns
+    -------
+    Strip
+        Close it, or use it in a `with` statement.
+
+    Raises
+    ------
+    InputError
+        Where the file is not what it claims to be; one line with the reason.
+    """
+    return Strip(StripReader(path, direction=direction, headerless=headerless))
+
+
+def survey(
+    strip: Strip | Path | str,
+    *,
+    waveforms: int | None = None,
+    divergence: float | None = None,
+    find_divergence: bool = False,
+    for_checks: bool = True,
+) -> Survey:
+    """Measure sensor and scene on a sample of the strip: noise, system pulse, saturation, overlapping echoes.
+
+    Parameters
+    ----------
+    strip : Strip, path or str
+        The strip, opened with `open_strip`, or its path.
+    waveforms : int, optional
+        Waveforms to look at, spread over the strip; 8192 by default, fewer where they are long.
+    divergence : float, optional
+        Full angle of the beam between the 1/e^2 points [mrad]. With it the survey also says whether echo widths tell
+        incidence angles.
+    find_divergence : bool
+        Also look for the beam's divergence in the widths of echoes from surfaces of known slope: the figures
+        `divergence_seen_mrad` and `divergence_seen_error_mrad`, where they tell.
+    for_checks : bool
+        Also measure by what a saved survey knows other strips of the sensor; it takes a tenth of the time.
+
+    Returns
+    -------
+    Survey
+        `.system` is the SystemPulse for `Chain.run`; `.decisions` say which parts of a chain the strip needs, and why.
+
+    Raises
+    ------
+    InputError
+        Where the strip cannot be read or holds no waveform.
+    """
+    from wavebatch.surveying.choose_chain import decide, read_sample  # `info` needs none of these
+    from wavebatch.surveying.flat_ground import survey_angles
+    from wavebatch.surveying.outgoing import compare_outgoing
+    from wavebatch.surveying.survey import survey_blocks
+    from wavebatch.surveying.systems.saved_check import with_look
+
+    if not isinstance(strip, Strip):
+        with open_strip(strip) as opened:
+            return survey(
+                opened, waveforms=waveforms, divergence=divergence, find_divergence=find_divergence,
+                for_checks=for_checks,
+            )  # fmt: skip
+    sample = read_sample(strip.reader, strip.scan, waveforms)
+    if not sample:
+        path = strip.facts.path
+        raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
+    found = compare_outgoing(survey_blocks(sample), strip.facts.path)
+    if for_checks:
+        found = with_look(found, sample)
+    if divergence is not None:
+        found = survey_angles(strip.reader, strip.scan, found, divergence)
+    elif find_divergence:
+        with contextlib.suppress(InputError):  # coordinates that are not in metres
+            found = survey_angles(strip.reader, strip.scan, found, None)
+    chosen = decide(found)
+    parts = {decision.part for decision in chosen}
+    # What the scene needs but no chain has without further files follows the decisions of the chosen chain.
+    others = (decision for decision in found.decisions if decision.part not in parts)
+    return replace(found, decisions=(*chosen, *others))

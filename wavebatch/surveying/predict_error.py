@@ -15,6 +15,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable, without_nan
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import distinct
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import bound_time
@@ -261,7 +262,7 @@ def _measure_class(
     expected = near / (FAR - NEAR) * FAR / min(PAIRS, len(block))
     if company:
         # A group with one more, hidden echo looks smaller: its near pair was not counted.
-        groups = len(np.unique(echoes.waveform[source]))
+        groups = len(distinct(echoes.waveform[source]))
         expected /= 1.0 - min(expected * len(excess) / groups, MOST_LOST)
     clear = (echoes.amplitude > CLEAR * system.noise.std) & ((number > 1) if company else (number == 1))
     there = np.histogram(excess_variance(echoes.take(np.flatnonzero(clear)), system), EXCESS)[0]

@@ -15,7 +15,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import robust_std
+from wavebatch.core.order import distinct, median, robust_std
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.units import AIR_ATTENUATION
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -363,7 +363,7 @@ def _from_file(
         longer = distance - np.sqrt(((rays.point - by_vectors.at(rays.time)) ** 2).sum(axis=1))
         longer = longer[np.isfinite(longer)]
         if len(longer):
-            farther, vectors_error = round(float(np.median(longer)), 3), round(seen.error, 6)
+            farther, vectors_error = round(float(median(longer)), 3), round(seen.error, 6)
             range_error_m = float(abs(np.mean(longer)) + np.std(longer))
             if range_error_m > seen.error:  # a contradiction is known no better than the vectors are
                 range_error_m = float(np.hypot(range_error_m, seen.error))
@@ -374,9 +374,9 @@ def _from_file(
             lag = NODE_SECONDS * np.einsum("ni,ni->n", by_vectors.xyz - known.at(by_vectors.time), step) / square
         there = np.isfinite(lag)
         if there.any():
-            middle = float(np.median(lag[there]))
+            middle = float(median(lag[there]))
             late = round(middle, 4)
-            behind = round(middle * float(np.sqrt(np.median(square[there]))) / NODE_SECONDS, 3)
+            behind = round(middle * float(np.sqrt(median(square[there]))) / NODE_SECONDS, 3)
     distance = distance[np.isfinite(distance)]
     facts = {
         "file": path.name,
@@ -395,7 +395,7 @@ def _from_file(
     return SensorSource(
         "trajectory",
         known,
-        distance=round(float(np.median(distance)), 2) if len(distance) else None,
+        distance=round(float(median(distance)), 2) if len(distance) else None,
         error=range_error_m,
         farther=farther,
         vectors_error=vectors_error,
@@ -492,7 +492,7 @@ def _turn_by_pairs(pairs: RaySample) -> tuple[np.ndarray, np.ndarray]:
     left = off
     for _ in range(3):
         size = np.sqrt((left * left).sum(axis=1))
-        good = size <= ray_convergence.CLIP * max(float(np.median(size)), 1e-12)
+        good = size <= ray_convergence.CLIP * max(float(median(size)), 1e-12)
         normal, right = (
             np.einsum("nki,nkj->ij", turns[good], turns[good]),
             np.einsum("nki,nk->i", turns[good], off[good]),
@@ -511,7 +511,7 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
     cosine = cosine[np.isfinite(cosine)]
     if not len(cosine):
         return 0.0
-    angle = float(np.median(np.arccos(cosine)))
+    angle = float(median(np.arccos(cosine)))
     if angle > LARGEST_ANGLE:
         raise InputError(
             f"the trajectory's rays are {np.degrees(angle):.1f} degrees off the packets' vectors: it belongs to "
@@ -541,7 +541,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
         return None
     origin = rays.time[0]
     cells = np.floor((rays.time - origin) / NODE_SECONDS)
-    nodes = np.unique(cells)
+    nodes = distinct(cells)
     if len(nodes) > MOST_NODES:
         return None
     found: list[tuple[ray_convergence.SensorFit, np.ndarray, np.ndarray]] = []
@@ -563,7 +563,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
             places += [low - BEYOND, low]
         if not np.any(nodes == node + 1):
             places += [high, high + BEYOND]
-        times = np.unique(places)
+        times = distinct(np.array(places))
         found.append((fit, times, np.clip(times, low, high)))
     if not found:
         return None
@@ -572,7 +572,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     xyz, velocity = (np.concatenate([part[i] for part in placed]) for i in (0, 1))
     xyz += velocity * (time - inside)[:, None]
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
-    distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
+    distance = round(float(median(np.array([fit.distance for fit, _, _ in found]))), 2)
     # The range's error over all windows: what the fits say, and what they contradict.
     squares, apart = [], []
     for number, (fit, _, within) in enumerate(found):
@@ -609,14 +609,14 @@ def _describe(
 ) -> tuple[tuple[str, Any], ...]:
     """Height, speed, heading and smoothness of a path, for reports."""
     speed = np.sqrt((path.velocity**2).sum(axis=1))
-    east, north, _ = np.median(path.velocity, axis=0)
+    east, north, _ = median(path.velocity, axis=0)
     facts: dict[str, Any] = {
         "windows": len(found),
-        "height_m": round(float(np.median(path.xyz[:, 2]) - np.median(rays.point[:, 2])), 2),
-        "speed_m_s": round(float(np.median(speed)), 2),
+        "height_m": round(float(median(path.xyz[:, 2]) - median(rays.point[:, 2])), 2),
+        "speed_m_s": round(float(median(speed)), 2),
         "heading_deg": round(float(np.degrees(np.arctan2(east, north)) % 360), 1),
-        "view_deg": round(float(np.degrees(np.median([fit.spread for fit, _, _ in found]))), 2),
-        "residual_deg": round(float(np.degrees(np.median([fit.residual for fit, _, _ in found]))), 6),
+        "view_deg": round(float(np.degrees(median(np.array([fit.spread for fit, _, _ in found])))), 2),
+        "residual_deg": round(float(np.degrees(median(np.array([fit.residual for fit, _, _ in found])))), 6),
     }
     if len(path.time) > 4:
         middle = np.arange(1, len(path.time) - 1)
@@ -624,5 +624,5 @@ def _describe(
         odd = middle[middle % 2 == 1]
         odd = odd[path.time[odd] < every.time[-1]]
         off = every.at(path.time[odd]) - path.xyz[odd]
-        facts["smoothness_m"] = round(float(np.median(np.sqrt((off * off).sum(axis=1)))), 4)
+        facts["smoothness_m"] = round(float(median(np.sqrt((off * off).sum(axis=1)))), 4)
     return tuple(facts.items())

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.order import median, quantile
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.defects import find_seam
@@ -293,7 +294,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     below, scatter = find_single(echoes, len(part), system) & (echoes.sigma < system.sigma_ref), 0.0
     if np.count_nonzero(below) >= ENOUGH_TO_LEARN:
         lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
-        excess = np.median(lack**2) / SQUARED_NORMAL_MEDIAN - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
+        excess = median(lack**2) / SQUARED_NORMAL_MEDIAN - median(echoes.sigma_err[below].astype(np.float64) ** 2)
         scatter = float(np.sqrt(max(excess, 0.0)))
     widths = LevelWidths(scatter=scatter)
     system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)
@@ -331,8 +332,8 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figu
         single_share=float((number == 1).mean()),
         overlapped_share=float(overlapped.mean()),
         echoes_per_waveform=float(number.mean()),
-        amplitude_50=float(np.median(echoes.amplitude)) if len(echoes) else 0.0,
-        amplitude_99=float(np.quantile(echoes.amplitude, 0.99)) if len(echoes) else 0.0,
+        amplitude_50=float(median(echoes.amplitude)) if len(echoes) else 0.0,
+        amplitude_99=quantile(echoes.amplitude, 0.99) if len(echoes) else 0.0,
         saturated_share=saturated,
         system_width_share=float((np.abs(deviation[narrow]) < 3).mean()) if narrow.any() else 0.0,
     )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.order import group_medians
+from wavebatch.core.order import group_medians, median
 from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
@@ -85,7 +85,7 @@ def stack_pulse(
     cut: samples that were cut off below, bool (m, s). The median does not see by how much, unless most are cut off.
     """
     step = float(np.clip(IN_BIN / max(len(amplitude), 1), STEP, 1.0))
-    least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
+    least = max(std / float(median(amplitude)), 1e-6) if len(amplitude) else 1e-6
     lag = np.reshape(first, (-1, 1)) + np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
     # Plus values spread evenly over one step of the counts, whose rounding has the standard deviation `std`: the median
@@ -201,7 +201,7 @@ def fit_skewed(stack: Stack, width: float) -> PulseFit:
 
 def _weights(stack: Stack) -> np.ndarray:
     """Inverse errors, none more than four times the typical one, mean 1."""
-    weight = 1 / np.maximum(stack.error, 0.25 * np.median(stack.error))
+    weight = 1 / np.maximum(stack.error, 0.25 * median(stack.error))
     return weight / weight.mean()
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.order import distinct
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.kernels import library
 from wavebatch.kernels.elementary import exp, log, log1p, solve
@@ -164,23 +165,21 @@ CORE = 2.5
 """Within this many widths of the main part a tail is one echo with it."""
 
 
-def pulse_tail(shape: PulseShape, width: float) -> PulseTail | None:
-    """After-pulses and ringing of a learned pulse.
+@lru_cache(maxsize=16)
+def pulse_tail(shape: PulseShape, width: float) -> PulseTail:
+    """After-pulses and ringing of a learned pulse; cached for the next block.
 
     Parameters
     ----------
     shape : PulseShape
-        Model of the pulse.
+        Learned, with further components.
     width : float, samples
         Width of the main part.
 
     Returns
     -------
-    PulseTail or None
-        None for a pulse without further components.
+    PulseTail
     """
-    if not shape.components:
-        return None
     reach = max(abs(delay) + 4 * np.sqrt(max(width**2 + extra, 0.0)) for _, delay, extra in shape.components)
     lag = np.arange(-np.ceil(reach / TAIL_STEP), np.ceil(reach / TAIL_STEP) + 1) * TAIL_STEP
     time, wide = np.zeros(1), np.full(1, width)
@@ -379,7 +378,7 @@ def residual_moments(
     """
     h3, h4 = np.zeros(len(time)), np.zeros(len(time))
     reach = np.minimum(np.ceil(HERMITE_REACH * width), s).astype(np.int32)
-    for size in np.unique(reach):
+    for size in distinct(reach):
         rows = np.flatnonzero(reach == size)
         for begin in range(0, len(rows), 4096):
             part = rows[begin : begin + 4096]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.order import median, quantile
 from wavebatch.core.units import MAD_TO_STD
 
 LARGEST_CONDITION = 1e5
@@ -176,7 +177,7 @@ def fit_sensor(
         return SensorFit(0.0, 1.0, *empty, np.inf, np.nan, 0.0, np.nan, len(used))
     centre = 0.5 * float(time.min() + time.max())
     half = max(0.5 * float(time.max() - time.min()), 1e-9)
-    origin = np.median(point[used], axis=0)
+    origin = median(point[used], axis=0)
     ground = point[used] - origin
     powers = np.vander((time - centre) / half, order + 1, increasing=True)
     with np.errstate(all="ignore"):
@@ -216,7 +217,7 @@ def fit_sensor(
         residual = float(np.sqrt(error[kept].sum() / freedom))
         left = side * np.sqrt(w)[:, None]
         ahead = ground - powers @ found
-        distance = float(np.median(np.sqrt(np.einsum("ni,ni->n", ahead, ahead))))
+        distance = float(median(np.sqrt(np.einsum("ni,ni->n", ahead, ahead))))
     found[0] += origin
     covariance = np.full(normal.shape, np.nan)
     conditions = []
@@ -311,7 +312,7 @@ def measure_extent(unit: np.ndarray) -> float:
     mean = unit.mean(axis=0)
     mean /= max(float(np.sqrt(mean @ mean)), 1e-12)
     off = unit - mean
-    return float(4.0 * np.arcsin(np.clip(0.5 * np.quantile(np.sqrt(np.einsum("ni,ni->n", off, off)), 0.98), 0, 1)))
+    return float(4.0 * np.arcsin(np.clip(0.5 * quantile(np.sqrt(np.einsum("ni,ni->n", off, off)), 0.98), 0, 1)))
 
 
 def _normal(powers: np.ndarray, across: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -330,7 +331,7 @@ def _solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 def _keep(error: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Weights, 0 for what lies beyond four robust standard deviations."""
-    limit = CLIP * max(float(np.median(error)), 1e-12)
+    limit = CLIP * max(float(median(error)), 1e-12)
     return np.where(error <= limit, weight, 0.0)
 
 

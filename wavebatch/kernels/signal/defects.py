@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.core.order import median, quantiles
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet
 
@@ -111,12 +112,12 @@ def find_transient(above: np.ndarray, std: float) -> int:
     if len(above) < 3 * LOOK:
         return 0
     usual = above[LOOK : 2 * LOOK]
-    low, middle, high = np.quantile(usual, [0.05, 0.5, 0.95], axis=1)
-    spread, centre = max(float(np.median(high - low)), 2 * std), float(np.median(middle))
+    low, middle, high = quantiles(usual, [0.05, 0.5, 0.95])
+    spread, centre = max(float(median(high - low)), 2 * std), float(median(middle))
     rises = np.abs(middle - centre).max() > OFF * std + 0.5
     if rises or np.mean(np.abs(usual - middle[:, None]) < 4 * std + 0.5) < 0.8:
         return 0
-    first_low, first_high = np.quantile(above[:LOOK], [0.05, 0.95], axis=1)
+    first_low, first_high = quantiles(above[:LOOK], [0.05, 0.95])
     inner = np.clip(above[:LOOK], first_low[:, None], first_high[:, None]).mean(axis=1)
     jumps = (first_high - first_low > WILD * spread) | (np.abs(inner - centre) > max(OFF * std, 0.3))
     return 0 if jumps.all() else int(np.argmin(jumps))
@@ -148,7 +149,8 @@ def find_seam(samples: np.ndarray) -> int:
         Index of the sample.
     """
     n, s = samples.shape
-    values = samples[:: max(n * s // MOST_SEAM_VALUES, 1)].astype(np.int64)
+    values = samples[:: max(n * s // MOST_SEAM_VALUES, 1)]
+    values = values.astype(np.int32 if values.dtype.itemsize <= 2 else np.int64)
     if len(values) < SEAM_ROWS or s < 2 * LEAST_RECORDING:
         return 0
     low = high = values
@@ -162,7 +164,7 @@ def find_seam(samples: np.ndarray) -> int:
     known = number >= SEAM_ROWS
     at = np.flatnonzero(known & (share >= SEAM_SHARE)) + SEAM_REACH
     at = at[(at >= LEAST_RECORDING) & (at < s - LEAST_RECORDING)]
-    return int(at[0]) if len(at) == 1 and np.median(share[known]) <= USUAL_SHARE else 0
+    return int(at[0]) if len(at) == 1 and median(share[known]) <= USUAL_SHARE else 0
 
 
 def fit_slopes(
@@ -204,8 +206,8 @@ def fit_slopes(
     low = np.stack([np.partition(part, len(part) // 4, axis=0)[len(part) // 4] for part in parts])
     place = (0.5 * (edges[1:] + edges[:-1] - 1) - 0.5 * (s - 1)).astype(np.float32)
     first, second = np.triu_indices(SEGMENTS, 1)
-    slope = np.median((low[second] - low[first]) / (place[second] - place[first])[:, None], axis=0)
-    level = np.median(low - slope * place[:, None], axis=0)
+    slope = median((low[second] - low[first]) / (place[second] - place[first])[:, None], axis=0)
+    level = median(low - slope * place[:, None], axis=0)
     number = total = np.zeros(signal.shape[1])
     for extra in (2.0, 1.0, 0.0):
         rest = signal - (level + slope * x)

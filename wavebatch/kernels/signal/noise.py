@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.order import known_median, median, quantile
+from wavebatch.core.order import known_median, median, quantile, quantiles
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, log, solve
 from wavebatch.kernels.library import call
@@ -657,7 +657,7 @@ def residual_noise(
     values = residual[used]
     if len(values) < LEAST_PAIRS:
         return None
-    low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
+    low, middle, high = quantiles(values, [0.1587, 0.5, 0.8413])
     # Quantiles of whole counts may give half of the spread, so that it is found in two steps.
     wide = 2 * CLIPPED * max(0.5 * (high - low), QUANTISATION_STD)
     spread = np.sqrt(np.mean(np.clip(values - np.float32(middle), -wide, wide) ** 2, dtype=np.float64))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.order import median
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, log
 
@@ -85,26 +86,26 @@ def find_reference(samples: np.ndarray) -> OutgoingReference | None:
     height = values[np.arange(len(values)), peak] - least
     # Half width at half height, from where samples cross it; it only has to tell quiet samples from others.
     above = (values - least[:, None]) > 0.5 * height[:, None]
-    width = max(float(np.median(above.sum(axis=1))) / 2.3548, 0.5)
+    width = max(float(median(above.sum(axis=1))) / 2.3548, 0.5)
     quiet = np.arange(values.shape[1]) < (peak - QUIET * width)[:, None]
     number = quiet.sum(axis=1)
     used = number >= 3
     if not used.any():
-        level = float(np.median(least))
-        return OutgoingReference(width, 1.0, 1.0, level, 0.0) if np.median(height) > LEAST_HEIGHT else None
+        level = float(median(least))
+        return OutgoingReference(width, 1.0, 1.0, level, 0.0) if median(height) > LEAST_HEIGHT else None
     means = np.where(quiet, values, 0).sum(axis=1)[used] / number[used]
     rest = np.where(quiet[used], values[used] - means[:, None], 0)
     freedom = float((number[used] - 1).sum())
     noise = max(float(np.sqrt((rest**2).sum() / freedom)), QUANTISATION_STD)
-    level = float(np.median(means))
+    level = float(median(means))
     # Against the level of all: against its own, the correlation of a few samples is always negative.
     away = np.where(quiet[used], values[used] - level, 0)
     gain = 1 + 2 * sum(_correlation(away, quiet[used], lag) for lag in range(1, MOST_LAGS + 1))
     gain = float(np.clip(gain, 1.0, 1 + 2 * MOST_LAGS))
-    within = noise**2 * gain / float(np.median(number[used]))
-    total = float(MAD_TO_STD * np.median(np.abs(means - level))) ** 2
+    within = noise**2 * gain / float(median(number[used]))
+    total = float(MAD_TO_STD * median(np.abs(means - level))) ** 2
     spread = float(np.sqrt(max(total - within, 0.0)))
-    return OutgoingReference(width, noise, gain, level, spread) if np.median(height) > LEAST_HEIGHT * noise else None
+    return OutgoingReference(width, noise, gain, level, spread) if median(height) > LEAST_HEIGHT * noise else None
 
 
 def _correlation(away: np.ndarray, quiet: np.ndarray, lag: int) -> float:

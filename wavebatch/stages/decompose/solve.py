@@ -135,13 +135,15 @@ def _explain_tails(
     Growth finds a dropped candidate again if the fit of the stronger echo leaves a residual there. `ref` is the width
     of the system pulse [samples].
     """
-    tail = pulse_tail(settings.shape, settings.width_ref)
-    if tail is None:
+    if not settings.shape.components:
         return candidates, None
+    tail = pulse_tail(settings.shape, settings.width_ref)
     waveform, time, amplitude, _ = candidates
     expected = np.zeros(len(waveform))
     for step in range(1, min(MOST_JOINED, len(waveform))):
         same = waveform[step:] == waveform[:-step]
+        if not same.any():
+            break
         lag = time[step:] - time[:-step]
         expected[step:] += np.where(same, amplitude[:-step] * tail_at(tail, lag), 0.0)
         expected[:-step] += np.where(same, amplitude[step:] * tail_at(tail, -lag), 0.0)

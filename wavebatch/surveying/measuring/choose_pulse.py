@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import distinct, quantile
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
@@ -146,7 +147,7 @@ class Candidate:
     @property
     def typical(self) -> float:
         """Mean length of a waveform's description; one in twenty, which no pulse explains, counts as the next lower."""
-        return float(np.minimum(self.length, np.quantile(self.length, 0.95)).mean())
+        return float(np.minimum(self.length, quantile(self.length, 0.95)).mean())
 
     def exceeds(self, other: Candidate) -> float:
         """Standard errors by which descriptions are longer than with another candidate."""
@@ -287,7 +288,7 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     written = 0.0 if known else 3 * gaussians * 0.5 * log(used) / len(block)
     length = describe_waveforms(block, borne, explained, [change])[0] + written
     return Candidate(
-        name, system, change, length, len(explained.echoes), len(np.unique(explained.echoes.waveform)), known,
+        name, system, change, length, len(explained.echoes), len(distinct(explained.echoes.waveform)), known,
         2 if known else gaussians, measure_change(borne, explained),
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import median, quantiles
 from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
@@ -126,7 +127,7 @@ def measure_change(system: SystemPulse, explained: Explained) -> float:
     if np.count_nonzero(known) < 2 * LEAST_KNOWN:
         return 0.0
     square = change[known] ** 2 / SQUARED_NORMAL_MEDIAN - 1 / precision[known]
-    return float(np.sqrt(np.clip(np.median(square), 0.0, 1.0)))
+    return float(np.sqrt(np.clip(median(square), 0.0, 1.0)))
 
 
 def describe_waveforms(
@@ -192,7 +193,7 @@ def exceed(length: np.ndarray, other: np.ndarray) -> float:
     The 2 % that differ most, either way, count as the next ones: what no pulse explains must not decide.
     """
     more = length - other
-    return count_errors(np.clip(more, *np.quantile(more, (0.02, 0.98))))
+    return count_errors(np.clip(more, *quantiles(more, (0.02, 0.98))))
 
 
 def find_own_width(explained: Explained, ref: float) -> float:

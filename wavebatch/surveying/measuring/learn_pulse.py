@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.order import median, quantile
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
@@ -61,7 +62,7 @@ def find_isolated(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -
     """
     top = system.saturation or float(block.samples.max())
     # At least half of them, where all are nearly as high.
-    highest = max(FAR_FROM_LIMIT * top, float(np.median(clear.amplitude)) if len(clear) else 0.0)
+    highest = max(FAR_FROM_LIMIT * top, float(median(clear.amplitude)) if len(clear) else 0.0)
     echoes = clear.take(np.flatnonzero(clear.amplitude <= highest))
     if len(echoes) < FEW:
         return echoes
@@ -89,7 +90,7 @@ def part_strong(echoes: EchoTable) -> tuple[EchoTable, EchoTable]:
         return echoes, echoes.take(np.empty(0, np.int64))
     narrow = echoes.take(np.flatnonzero(echoes.sigma < WIDENED * find_edge(echoes.sigma)))
     share = min(max(1 - FEW / len(narrow), 0.0), 0.8)
-    strong = narrow.amplitude >= np.quantile(narrow.amplitude, share)
+    strong = narrow.amplitude >= quantile(narrow.amplitude, share)
     parts = (np.flatnonzero(strong), MOST_STRONG), (np.flatnonzero(~strong), MOST_STRONG // 4)
     first, second = (narrow.take(rows[:: max(len(rows) // most, 1)]) for rows, most in parts)
     return first, second
@@ -117,7 +118,7 @@ def learn_pulse(
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
     cut = block.samples[main.waveform] <= floor_level(system)
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, cut=cut)
-    strongest = float(np.quantile(main.amplitude, 0.99))
+    strongest = quantile(main.amplitude, 0.99)
     goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL
     sums = fit_gaussians(stack, width, FIRST_COMPONENTS, 0.0 if small else goal)
@@ -128,7 +129,7 @@ def learn_pulse(
     if not small:
         # The first fit whose misfit is below the goal, or that the errors of the stack allow, or that is near the best.
         # By its errors: what a few lags of the tail show for sure is nothing in the mean of all.
-        fits, error = [sums[0], skewed, *sums[1:]], np.maximum(stack.error, 0.25 * np.median(stack.error))
+        fits, error = [sums[0], skewed, *sums[1:]], np.maximum(stack.error, 0.25 * median(stack.error))
         chi = [float(np.sqrt(np.mean((_draw_scaled(fit, stack) / error - stack.value / error) ** 2))) for fit in fits]
         enough = max(GOAL, NEAR_BEST * min(chi))
         best = next(fit for fit, one in zip(fits, chi, strict=True) if one <= enough or fit.rms <= goal)
@@ -169,7 +170,7 @@ def _fit_wide_best(
         residual = adaptive(part, noise, pulse, alone, max_echoes=1).residual
         if not len(residual):
             return pulses[0]
-        misfits.append(float(np.quantile(residual, 0.1)))
+        misfits.append(quantile(residual, 0.1))
     return pulses[1] if misfits[1] < BETTER * misfits[0] else pulses[0]
 
 

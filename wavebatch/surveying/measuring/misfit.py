@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.order import distinct, median, quantile, quantiles
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.learn_pulse import ONSET
@@ -124,7 +125,7 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
     """
     if not len(echoes):
         return system
-    seen = ABOVE_NOISE * system.noise.std / max(float(np.quantile(echoes.amplitude, 0.99)), 1e-9)
+    seen = ABOVE_NOISE * system.noise.std / max(quantile(echoes.amplitude, 0.99), 1e-9)
     return replace(system, faint_share=min(max(PEAK * max(system.misfit, change), seen), system.faint_share))
 
 
@@ -264,7 +265,7 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         np.maximum.at(beside, owner[near], share[near])
         whole = (low < place - 2) & (high > place + 2)
         likely = []
-        for middle in np.unique(np.round(log(share[here[must[here]]]), 1)):
+        for middle in distinct(np.round(log(share[here[must[here]]]), 1)):
             part = float(exp(middle))
             seen = whole & (least < LESS * part)
             alike = seen & (np.abs(log(np.maximum(highest, 1e-9)) - middle) < SAME_SHARE)
@@ -275,12 +276,12 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
             chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
             with_it = np.count_nonzero(alike)
             least_number = max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1))
-            if with_it >= least_number and len(np.unique(tenth[alike])) >= PLACES:
+            if with_it >= least_number and len(distinct(tenth[alike])) >= PLACES:
                 likely.append((with_it - without, alike))
         if likely:
             alike = max(likely, key=lambda one: one[0])[1]
-            part = float(np.quantile(highest[alike], 1 - NORMAL_BELOW[1]))  # targets and noise move it
-            around = np.unique(np.rint(lag[here[alike[owner[here]]]])[:, None] + (-1, 0, 1))
+            part = quantile(highest[alike], 1 - NORMAL_BELOW[1])  # targets and noise move it
+            around = distinct((np.rint(lag[here[alike[owner[here]]]])[:, None] + (-1, 0, 1)).ravel())
             for at in around[np.abs(around) >= 3]:
                 profile[at * ref] = max(profile.get(at * ref, 0.0), part)
     return replace(system, tail_misfit=tuple(sorted((float(lag), float(share)) for lag, share in profile.items())))
@@ -323,7 +324,7 @@ class ResidualShares:
         share = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
         self.share = share / fitted.amplitude[:, None]
         self.lag[~np.isfinite(residual)] = np.nan
-        self.noise = float(system.noise.std / np.median(fitted.amplitude) / np.sqrt(energy))
+        self.noise = float(system.noise.std / median(fitted.amplitude) / np.sqrt(energy))
 
     def look(self, place: int) -> Seen:
         """What is left within half a width of the pulse of this lag [widths]."""
@@ -331,9 +332,9 @@ class ResidualShares:
         here, number = self.share[inside], int(np.count_nonzero(inside.any(axis=1)))
         if not number:
             return Seen(1, 0.0, 0.0, 0.0, np.inf)
-        lowest, low = np.quantile(here, NORMAL_BELOW)
+        lowest, low = quantiles(here, NORMAL_BELOW)
         spread = max(low - lowest, self.noise)
-        return Seen(number, lowest, low + spread, np.median(here), spread)
+        return Seen(number, lowest, low + spread, median(here), spread)
 
 
 def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:

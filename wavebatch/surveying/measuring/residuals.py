@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.order import group_medians
+from wavebatch.core.order import distinct, group_medians, median, quantile, quantiles
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
@@ -236,9 +236,9 @@ def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[
         return 0.0, rows, np.zeros(0)
     power = np.where(whole, left * left / np.maximum(energy, 1e-6), 0).sum(axis=0)[rows] / number[rows]
     # Median of chi2 with k degrees of freedom, over k; not fewer than 4, since what drifts is alike in all waveforms.
-    freedom = np.maximum(np.median(number[rows]) / (2.5 * width + 1), 4.0)
-    typical = float(np.median(power) / (1 - 2 / (9 * freedom)) ** 3)
-    calm = power <= np.quantile(power, CALM)
+    freedom = np.maximum(median(number[rows]) / (2.5 * width + 1), 4.0)
+    typical = float(median(power) / (1 - 2 / (9 * freedom)) ** 3)
+    calm = power <= quantile(power, CALM)
     shape = filter_autocorrelation(taps)
     lack = max(typical - float(power[calm].mean()), 0.0) / (2 * np.sum(shape * shape) - 1)
     return float(np.sqrt(typical)), rows[calm], lack * shape
@@ -248,7 +248,7 @@ def _robust_std(values: np.ndarray) -> float:
     """Standard deviation from the central two thirds of the values, which rounding to whole counts does not spoil."""
     if len(values) < 100:
         return 0.0
-    low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
+    low, middle, high = quantiles(values, [0.1587, 0.5, 0.8413])
     kept = values[np.abs(values - middle) < 4 * max(0.5 * (high - low), QUANTISATION_STD)]
     return float(np.sqrt(np.mean((kept.astype(np.float64) - np.mean(kept, dtype=np.float64)) ** 2)))
 
@@ -277,10 +277,10 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
     spread : float64 (k,)
         Their standard deviation, from the median of their distances from it.
     """
-    classes = min(max(len(np.unique(height)) // GROWTH_CLASS, 1), 8)
+    classes = min(max(len(distinct(height)) // GROWTH_CLASS, 1), 8)
     bins = int(2 * reach / GROWTH_STEP)
     place = np.clip(((lag + reach) / GROWTH_STEP).astype(np.int64), 0, bins - 1)
-    place += bins * np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
+    place += bins * np.searchsorted(quantiles(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
     number = np.bincount(place)
     middle, spread = group_medians(values, place)
     return middle[place], number[place], spread[place]
@@ -335,11 +335,11 @@ def _noise_gain(
     signal = (model[core].astype(np.float64) * (1 - 2 * taken) + height * brought) / (1 - taken)
     if len(signal) < 2000:
         return 0.0
-    edges = np.quantile(signal, np.linspace(0, 1, 13))
+    edges = quantiles(signal, np.linspace(0, 1, 13))
     place = np.clip(np.searchsorted(edges, signal) - 1, 0, 11)
     filled = [i for i in range(12) if (place == i).any()]
-    level = np.array([np.median(signal[place == i]) for i in filled])
-    variance = np.array([np.median(squared[place == i]) for i in filled]) * MAD_TO_STD**2
+    level = np.array([median(signal[place == i]) for i in filled])
+    variance = np.array([median(squared[place == i]) for i in filled]) * MAD_TO_STD**2
     # A pulse that misses its echoes leaves what grows with the square of the signal: only the linear part is noise.
     scale = np.hypot(variance, std**2)
     terms = np.stack([np.ones_like(level), level, level * level], axis=1) / scale[:, None]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wavebatch.core.order import median
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
@@ -128,8 +129,8 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     left = explain(block.rows(lone), whitened, max_echoes=1).echoes.residual.astype(np.float64) ** 2
     if len(left) < FEW:
         return plain
-    typical = np.median(left)
-    error = MEDIAN_ERROR * MAD_TO_STD * np.median(np.abs(left - typical)) / np.sqrt(len(left))
+    typical = median(left)
+    error = MEDIAN_ERROR * MAD_TO_STD * median(np.abs(left - typical)) / np.sqrt(len(left))
     if typical - error > MOST_LEFT:
         return plain
     # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.

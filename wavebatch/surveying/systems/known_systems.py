@@ -20,6 +20,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import StripWarning
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import median, quantiles
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
@@ -72,6 +73,9 @@ class KnownSystem:
     """For people, for example RIEGL LMS-Q680i."""
     spacing: float
     """Of the samples that it was measured with [ns]."""
+    unlike_gaussian: float
+    """Difference from the Gaussian that is most like it, as `compare_pulses` measures it; to measure it takes longer
+    than to survey some strips."""
     system: SystemPulse
 
 
@@ -82,7 +86,9 @@ def known_systems() -> tuple[KnownSystem, ...]:
     for path in sorted(Path(__file__).parent.glob("*.toml")):
         table = parse_toml(read_text(path, "system file"), str(path))
         spacing = table.table("figures").number("spacing_ns", 1e-3, 1e3)
-        found.append(KnownSystem(path.stem, table.get("sensor", str), spacing, read_system(table.table("system"))))
+        unlike = table.number("unlike_gaussian", 0.0, 1.0)
+        system = read_system(table.table("system"))
+        found.append(KnownSystem(path.stem, table.get("sensor", str), spacing, unlike, system))
     return tuple(found)
 
 
@@ -146,8 +152,8 @@ def guess_width(block: WaveformBlock, system: SystemPulse) -> SystemPulse | None
     lone = find_lone(block, system, len(block))
     if len(lone) < LEAST_ECHOES:
         return None
-    low, middle = np.quantile(lone.sigma, (0.25, 0.5))
-    width = min(low + 0.674 * float(np.median(lone.sigma_err)), middle)
+    low, middle = quantiles(lone.sigma, (0.25, 0.5))
+    width = min(low + 0.674 * float(median(lone.sigma_err)), middle)
     # Not below half a sample, as for isolated echoes: spikes are no pulses.
     return replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
 
@@ -198,12 +204,9 @@ def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
     near = (known for known in known_systems() if abs(spacing / known.spacing - 1) < SAME_SPACING)
     found = [Likeness(known, compare_pulses(system, known.system)) for known in near]
     best = min(found, key=lambda one: one.difference, default=None)
-    if best is None or best.difference >= ALIKE:
+    if best is None or best.difference >= min(ALIKE, NOT_A_GAUSSIAN * best.known.unlike_gaussian):
         return None
-    widths = best.known.system.sigma_ref * np.linspace(0.7, 1.5, 21)
-    nearest = min(compare_pulses(best.known.system, SystemPulse(sigma_ref=float(width))) for width in widths)
-    limit = min(ALIKE, NOT_A_GAUSSIAN * nearest)
-    return best if best.difference < limit else None
+    return best
 
 
 def compare_pulses(a: SystemPulse, b: SystemPulse) -> float:
@@ -302,7 +305,7 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
     for centre in np.arange(-REACH, REACH, 0.5):
         here = np.abs(lags - centre) <= 1
         if np.count_nonzero(here) >= FEW:
-            alike = np.abs(ratios - np.median(ratios[here])) < SAME_RATIO
+            alike = np.abs(ratios - median(ratios[here])) < SAME_RATIO
             chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
             most = max(most, float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
     return 2 * most / max(len(echoes), 1)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.order import distinct, median, quantile
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.decompose import Candidates, Clusters, Settings, decompose_clusters
 from wavebatch.stages.detect.direct import samples_of
@@ -63,7 +64,7 @@ def measure_skew(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     if len(rows) < ENOUGH_TO_LEARN:
         return system
     # Not every second or third: channels take turns.
-    chosen = echoes.take(rows[np.unique(np.linspace(0, len(rows) - 1, MOST_FITTED).astype(np.int64))])
+    chosen = echoes.take(rows[distinct(np.linspace(0, len(rows) - 1, MOST_FITTED).astype(np.int64))])
     # A skewed pulse is fitted to each of them alone.
     spacing, s = block.spacing, block.samples.shape[1]
     part = block.rows(chosen.waveform)
@@ -80,7 +81,7 @@ def measure_skew(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     narrow = known & (chosen.sigma < NARROW * find_edge(chosen.sigma))
     if np.count_nonzero(narrow) < FEW:
         return system
-    typical = float(np.median(skew[narrow]))
-    scatter = float(np.quantile(np.abs(skew[known] - typical), MOST)) / NORMAL_MOST
-    excess = scatter**2 - float(np.median(error[known] ** 2))
+    typical = float(median(skew[narrow]))
+    scatter = quantile(np.abs(skew[known] - typical), MOST) / NORMAL_MOST
+    excess = scatter**2 - float(median(error[known] ** 2))
     return replace(system, skew=typical, skew_spread=max(float(np.sqrt(max(excess, 0.0))), LEAST_SPREAD))

@@ -209,7 +209,8 @@ def parse_survey(text: str, name: str) -> SavedSurvey:
     """
     table = parse_toml(text, name)
     table.check_kind("system")
-    known = ("schema", "version", "strip", "sensor", "waveforms", "system", "figures", "decision", "fingerprint")
+    known = ("schema", "version", "strip", "sensor", "unlike_gaussian", "waveforms", "system", "figures", "decision",
+             "fingerprint")  # fmt: skip
     table.check_keys(known, ("schema", "system"), tables.REMEDY)
     table.check_schema(SYSTEM_SCHEMA, "survey again")
     system = tables.read_system(table.table("system"))
