@@ -163,6 +163,8 @@ FILES = [
     *((f"{words} run/strip.laz", 1, "4, 5, 9 or 10; `wavebatch info` and `stats` read a cloud that wavebatch wrote\n")
       for words in ("survey", "voxelize --size 1 -o v.npz")),
     ("survey shares.las", 1, "4, 5, 9 or 10; `wavebatch info` and `stats` read clouds\n"),
+    *((f"info {name}", 1, "it is a compressed file or an archive .. unpack it", {name: begin + "\0" * 400})
+      for name, begin in (("s.las.gz", "\x1f\udc8b\b"), ("s.zip", "PK\3\4"), ("s.7z", "7z\udcbc\udcaf'"))),
     ("info e.las", 1, "it is empty", {"e.las": ""}),
     ("info e.las", 1, "e.las: not a LAS or LAZ file (it does not begin with LASF)\n", {"e.las": "nothing"}),
     ("bench none.las", 1, "none.las"),
@@ -469,7 +471,7 @@ def test_what_is_wrong_is_one_line_an_exit_code_and_no_file(place, monkeypatch, 
     made = {place / name: text for one in texts for name, text in one.items()}
     try:
         for path, text in made.items():
-            path.write_text(text)
+            path.write_text(text, "utf-8", "surrogateescape")
         _refuse(place, command, code, words)
     finally:
         for path in made:

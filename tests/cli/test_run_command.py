@@ -84,8 +84,8 @@ def test_a_bar_on_request(tiny_strip, tmp_path):
 
 def test_verbose_says_what_the_automatic_chain_leaves_out_and_why(tiny_strip, tmp_path):
     loud = _run(tiny_strip, "-o", tmp_path / "v", "-v")
-    assert "growth of fits: kept: of the " in loud.stderr and "censored fit: left out: " in loud.stderr
-    assert "left out: " not in _run(tiny_strip, "-o", tmp_path / "w").stderr
+    assert "growth of fits: yes: of the " in loud.stderr and "censored fit: no: " in loud.stderr
+    assert "censored fit" not in _run(tiny_strip, "-o", tmp_path / "w").stderr
 
 
 def test_quiet_says_nothing_and_verbose_more(tiny_strip, tmp_path):

@@ -52,7 +52,7 @@ def test_the_text_has_every_measure_and_every_decision(flat_strip, surveyed):
         end = f"{value:.3f} DN" if value > 0 else "not known: too few samples"
         assert any(line.startswith(f"  {NOISE_KINDS[kind]} ") and line.endswith(end) for line in lines), kind
     for decision in decide(found):
-        word = "needed" if decision.needed else "left out"
+        word = "yes" if decision.needed else "no"
         assert any(line.startswith(f"  {word}") and decision.part in line and decision.reason in line for line in lines)
     assert any("s_ref 2.0" in line for line in lines) and any(line.endswith("  chosen") for line in lines)
     assert str(folder / "SYSTEM.toml") in result.stderr and str(folder / "CHAIN.toml") in result.stderr
@@ -74,7 +74,7 @@ def test_the_files_say_the_same(flat_strip, surveyed):
     }.items()  # what is written are the decisions of the chain, not those of the survey before them
     assert saved.strip == "flat.las" and saved.fingerprint == take_fingerprint(flat_strip)
     assert (folder / "CHAIN.toml").read_text() == chain_text(saved.survey)
-    assert "# growth of fits: left out: " in (folder / "CHAIN.toml").read_text()
+    assert "# growth of fits: no: " in (folder / "CHAIN.toml").read_text()
     assert load_chain_file(folder / "CHAIN.toml").steps[2].effective()["max_echoes"] == 1
 
 

@@ -25,7 +25,7 @@ from wavebatch.tools.simulate.render import PulseModel
 
 OPEN_FIGURES = Figures(empty_share=0.2, overlapped_share=0.0005)
 DECISIONS = (
-    Decision("learned pulse", False, "a simpler pulse reaches the noise"),
+    Decision("sum of Gaussians", False, "a simpler pulse reaches the noise"),
     Decision("growth of fits", False, "says the survey"),
     Decision("width prior", False, "says the survey"),
     Decision("echo width", True, "the system pulse is 2.00 samples wide (limit 0.85)"),
@@ -53,11 +53,11 @@ def test_an_open_scene_gets_one_fit_per_maximum_and_reads_why():
     ]  # fmt: skip
     assert not _grows(survey)
     comments = [line for line in chain_text(survey).splitlines() if line.startswith("# ")]
-    for part in ("learned pulse", "growth of fits", "incidence angle"):
-        assert any(line.startswith(f"# {part}: left out: ") for line in comments)
-    assert any(line.startswith("# width prior: kept: ") for line in comments)
+    for part in ("sum of Gaussians", "growth of fits", "incidence angle"):
+        assert any(line.startswith(f"# {part}: no: ") for line in comments)
+    assert any(line.startswith("# width prior: yes: ") for line in comments)
     out = [decision.part for decision in decide(survey) if not decision.needed]
-    assert out == ["learned pulse", "growth of fits", "incidence angle"]
+    assert out == ["sum of Gaussians", "growth of fits", "incidence angle"]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_no_widths_of_an_undersampled_pulse():
     survey = _survey(decisions)
     chain = choose_chain(survey)
     assert "attribute.echo_width" not in _stages(chain)
-    assert "# echo width: left out: the system pulse is 0.64" in chain_text(survey)
+    assert "# echo width: no: the system pulse is 0.64" in chain_text(survey)
 
 
 def test_columns_that_the_chosen_chain_leaves_out_are_not_written(tmp_path):
@@ -103,9 +103,9 @@ def test_columns_that_the_chosen_chain_leaves_out_are_not_written(tmp_path):
 
 
 def test_a_reason_of_several_lines_stays_one_comment():
-    decisions = (Decision("growth of fits", False, ""), Decision("learned pulse", False, "a\n[[chain]]"))
+    decisions = (Decision("growth of fits", False, ""), Decision("sum of Gaussians", False, "a\n[[chain]]"))
     text = chain_text(_survey(decisions))
-    assert "# learned pulse: left out: a [[chain]]" in text
+    assert "# sum of Gaussians: no: a [[chain]]" in text
     assert parse_chain(text, "x").steps[2].stage.name == "decompose.adaptive"
 
 

@@ -259,7 +259,7 @@ def test_a_scanner_channel_that_was_not_calibrated_is_named(tmp_path):
     targets = write_targets(tmp_path / "t.csv", (0.3, 40, -15, 70, 15))
     assert call("calibrate", strips[1], "--targets", targets, "-o", tmp_path / "one.toml").exit_code == 0
     done = run_with(tmp_path, strips[0], tmp_path / "one.toml")
-    assert done.exit_code == 0 and "scanner channel 0 of digitizer 1 was not calibrated" in done.stderr
+    assert done.exit_code == 0 and "digitizer 1 was not calibrated on scanner channel 0" in done.stderr
     assert np.isfinite(wb.read_cloud(tmp_path / "out" / "0.laz")["reflectance"]).mean() == pytest.approx(0.5, abs=0.02)
 
 
@@ -268,9 +268,10 @@ def test_a_scanner_channel_that_was_not_calibrated_is_named(tmp_path):
     ("change", "message"),
     [
         ({"bits": 8, "light": 6e7}, "digitizer 1 has 8 bits, the calibration 16"),
-        ({"spacing": 0.5, "n_samples": 160}, "has a spacing of 0.5 ns, the calibration 1"),
+        ({"spacing": 0.5, "n_samples": 160, "gains": {1: 1.0, 2: 0.5, 3: 0.5}},
+         "calibrated: digitizer 1 (and 2 others) has a spacing of 0.5 ns, the calibration 1; measure"),  # one sentence
         ({"descriptor_gain": 0.01}, "has a gain of 0.01 V per count, the calibration 1"),
-        ({"pulse": ((1.0, 0.0, 1.0),)}, "its pulse is 2.36 ns wide, that of the calibration 4.71 ns"),
+        ({"pulse": ((1.0, 0.0, 1.0),)}, "has a pulse of 2.36 ns, the calibration one of 4.71 ns"),
         ({"gains": {3: 0.5}}, "digitizer 3 was not calibrated, only 1, 2, which may have another gain"),
     ],
 )

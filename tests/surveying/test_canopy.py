@@ -175,7 +175,7 @@ def test_echoes_hidden_in_the_noise_are_not_taken_for_it(tmp_path):
     assert result["right"] and result["missed"] < 0.02 and result["extra"] < 0.01
     with wavebatch.open_strip(make_strip(2395, tmp_path)) as strip:
         reasons = {one.part: one.reason for one in wavebatch.survey(strip).decisions}
-    less, more = map(float, re.findall(r"\d\.\d+", reasons["noise without hidden echoes"]))
+    less, more = map(float, re.findall(r"\d\.\d+", reasons["echoes hidden in the noise"]))
     assert less < 0.9 * more
 
 

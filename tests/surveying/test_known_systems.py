@@ -96,7 +96,7 @@ def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points
     assert _count_echoes(path, small) == pytest.approx(_count_echoes(path, whole), rel=error)
     if small.figures.isolated_echoes < 20:
         assert find_source(small.system).name == "riegl-q680i"
-        reason = next(one.reason for one in small.decisions if one.part == "learned pulse")
+        reason = next(one.reason for one in small.decisions if one.part == "sum of Gaussians")
         assert reason.startswith("riegl-q680i: ")
 
 

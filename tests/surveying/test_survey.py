@@ -51,7 +51,7 @@ def test_the_simplest_pulse_that_serves_is_chosen(pulse, kind):
         assert after[0] == pytest.approx(10.5, abs=0.5) and after[1] == pytest.approx(0.04, abs=0.01)
         assert system.ringing == pytest.approx(0.04, abs=0.01)
     needed = {decision.part: decision.needed for decision in survey.decisions}
-    assert needed["learned pulse"] is (kind == "learned") and needed["skewed pulse"] is (kind == "skewed")
+    assert needed["sum of Gaussians"] is (kind == "learned") and needed["skewed pulse"] is (kind == "skewed")
 
 
 @pytest.mark.slow

@@ -490,7 +490,7 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         line = (
             f"{choice.chain.name or 'this chain'}: does not fit this strip's pulse, which is no plain Gaussian: about "
             f"{round(share * echoes)} of its {echoes} echoes are false ({100 * share:.0f} % in a trial with the "
-            f"learned pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
+            f"survey's pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
         )
         found += warn("false-echoes", [line])
     found += warn("no-value", _explain_columns(prepared, report)[1])

@@ -84,7 +84,7 @@ class Progress(Closing):
             for one in event["warnings"]:
                 say = self._say if StripWarning(**one).is_loud else self._tell
                 say(messages.printable(f"{strip}: warning: {one['text']}"))
-            chosen = [f"{one['part']}: {'kept' if one['needed'] else 'left out'}: {one['reason']}"
+            chosen = [f"{one['part']}: {'yes' if one['needed'] else 'no'}: {one['reason']}"
                       for one in event["decisions"]]  # fmt: skip
             more = [*chosen, *_sensor_lines(event["sensor"])]
             for column, counts in sorted(event["counts"]["no_data"].items()):

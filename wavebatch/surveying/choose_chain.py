@@ -113,7 +113,7 @@ def chain_text(survey: Survey) -> str:
 
 def _comment(decision: Decision) -> str:
     reason = " ".join(decision.reason.split())
-    return f"# {decision.part}: {'kept' if decision.needed else 'left out'}: {reason}"
+    return f"# {decision.part}: {'yes' if decision.needed else 'no'}: {reason}"
 
 
 def widest_chain() -> Chain:

@@ -302,8 +302,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
     if lowered:
-        reason = f"{system.noise.std:.2f} DN, not {lowered:.2f}: echoes found with less are shorter to describe"
-        decisions = (*decisions, Decision("noise without hidden echoes", True, f"{reason}, and few are in the mirror"))
+        reason = f"noise is {system.noise.std:.2f} DN without them, {lowered:.2f} with them; the echoes found "
+        reason += "with less noise describe the waveforms shorter, and few of them are false"
+        decisions = (*decisions, Decision("echoes hidden in the noise", True, reason))
     if repeated:
         share, lags = max(share for _, share in repeated), f"{repeated[0][0]:+.1f} to {repeated[-1][0]:+.1f} ns"
         reason = f"every strong echo has one of up to {100 * share:.1f} % of it at {lags}: echoes there must be higher"

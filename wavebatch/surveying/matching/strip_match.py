@@ -19,7 +19,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.errors import InputError
-from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.units import FWHM_PER_SIGMA, count
 from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.header import decode_text
@@ -365,19 +365,22 @@ def match_strip(
         found, missing[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
         rows += found
     have, seen = {(row.digitizer, row.scanner) for row in rows}, settings.see_channels(reader, scan)
-    problems = {
-        f"{missing[index] or f'scanner channel {scanner} of digitizer {index} was not calibrated'}": share
-        for (index, scanner), share in seen.items()
-        if (index, scanner) not in have
-    }
+    problems: dict[str, dict[int, float]] = {}  # share of the waveforms by digitizer, for each reason
+    for (index, scanner), share in seen.items():
+        if (index, scanner) not in have:
+            shares = problems.setdefault(missing[index] or f"was not calibrated on scanner channel {scanner}", {})
+            shares[index] = shares.get(index, 0.0) + share
+    named: dict[str, float] = {}
+    for problem, shares in problems.items():
+        others = f" (and {count(len(shares) - 1, 'other')})" if len(shares) > 1 else ""
+        named[f"digitizer {min(shares)}{others} {problem}"] = sum(shares.values())
     if not have & seen.keys():
         raise InputError(
-            f"{reader.facts.path}: --calibration: none of the strip's channels is calibrated: {'; '.join(problems)}; "
+            f"{reader.facts.path}: --calibration: none of the strip's channels is calibrated: {'; '.join(named)}; "
             "measure this sensor with `wavebatch calibrate`"
         )
     warnings += [
-        f"calibration: no calibrated values for {share:.0%} of the waveforms: {problem}"
-        for problem, share in problems.items()
+        f"calibration: no calibrated values for {share:.0%} of the waveforms: {line}" for line, share in named.items()
     ]
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
     if calibration.strips:
@@ -419,7 +422,7 @@ def _match_digitizer(
     found = exact or _pool_lengths(fitting, digitizer)
     if not found:
         numbers = ", ".join(sorted({str(row.digitizer) for row in fitting}, key=int))
-        return [], f"digitizer {digitizer.index} was not calibrated, only {numbers}, which may have another gain"
+        return [], f"was not calibrated, only {numbers}, which may have another gain"
     ratio = pulse / (found[0].pulse_ns or pulse)
     if max(ratio, 1 / ratio) > NEAR_WIDTH:
         warnings.append(
@@ -431,19 +434,19 @@ def _match_digitizer(
 
 
 def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float) -> str:
-    """Why a channel's constant cannot hold for a digitizer; empty where it can. What is not known is not checked."""
+    """What a digitizer has that excludes a channel's constant; empty where nothing does. Unknowns are not checked."""
     if row.bits is not None and row.bits != digitizer.bits:
-        return f"digitizer {digitizer.index} has {digitizer.bits} bits, the calibration {row.bits}"
+        return f"has {digitizer.bits} bits, the calibration {row.bits}"
     for name, unit, own, other in (
         ("spacing", "ns", digitizer.spacing, row.spacing_ns),
         ("gain", "V per count", digitizer.gain, row.gain),
     ):
         if other is not None and abs(own - other) > SAME * max(abs(own), abs(other)):
-            return f"digitizer {digitizer.index} has a {name} of {own:g} {unit}, the calibration {other:g}"
+            return f"has a {name} of {own:g} {unit}, the calibration {other:g}"
     ratio = pulse / (row.pulse_ns or pulse)
     if max(ratio, 1 / ratio) > OTHER_WIDTH:
         slopes = " (if slopes widen it, put divergence_mrad of the data sheet into CAL.toml)" if ratio > 1 else ""
-        return f"its pulse is {pulse:.3g} ns wide, that of the calibration {row.pulse_ns:.3g} ns{slopes}"
+        return f"has a pulse of {pulse:.3g} ns, the calibration one of {row.pulse_ns:.3g} ns{slopes}"
     return ""
 
 

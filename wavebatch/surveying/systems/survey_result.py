@@ -36,7 +36,8 @@ WIDE, HIGH, MARGIN = 320, 140, 16
 class Part(StrEnum):
     """Parts of a chain that a survey decides on; the values stand in files and reports."""
 
-    PULSE = "learned pulse"
+    PULSE = "sum of Gaussians"
+    """As pulse: learned from the strip, or a shipped one."""
     SKEW = "skewed pulse"
     GROWTH = "growth of fits"
     PRIOR = "width prior"

@@ -50,7 +50,7 @@ MOST_DRAWN = 6
 
 def survey_sheet(survey: Survey, document: Mapping[str, Any]) -> Sheet:
     """The sheet of a survey; document: what `survey --json` prints, or its `decisions` alone for the page of a run."""
-    rows = [["needed" if one["needed"] else "left out", one["part"], one["reason"]] for one in document["decisions"]]
+    rows = [["yes" if one["needed"] else "no", one["part"], one["reason"]] for one in document["decisions"]]
     decisions = Table(("decisions", "part of the chain", "reason"), rows)
     chosen = [decisions] if rows else [Note("The survey did not choose the chain: the user gave it.")]
     pictures = Later(partial(_draw_survey, survey))
