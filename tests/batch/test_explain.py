@@ -131,7 +131,7 @@ def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
     known.write_text(re.sub("echoes_in_doubt = .*", "echoes_in_doubt = 0.08", known.read_text()))
     (line,) = warn_quietly(neon, tmp_path / "out", "--system", str(known))
     assert "found 8 % of the echoes in doubt" in line
-    assert "in doubt: the noise of 5.45 DN is a guess, and so is what the pulse misses of echoes, nothing" in line
+    assert "in doubt: the noise of 5.45 DN is a guess, as is the pulse's misfit of 0 % of the amplitude, and" in line
     assert "--system" in line
 
 

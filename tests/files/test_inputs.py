@@ -1,5 +1,8 @@
 """Which strips an argument list means."""
 
+import subprocess
+import sys
+
 import click
 import pytest
 from commands import run_command
@@ -33,6 +36,14 @@ def test_globs_mean_strips_only(folder):
 def test_a_list_is_relative_to_itself_and_may_hold_all_of_it(folder):
     (folder / "strips.txt").write_text("# night of the 21st\n\nb.las\nsub\n*.LAZ\n")
     assert _names([f"@{folder / 'strips.txt'}"]) == ["b.las", "c.laz", "a.LAZ"]
+
+
+@pytest.mark.parametrize("name", ["@-", "@/dev/stdin"])
+def test_a_list_from_a_pipe_is_relative_to_where_the_command_runs(folder, name):
+    """`find ... | wavebatch run @-`; names were looked for in /dev."""
+    command = [sys.executable, "-m", "wavebatch", "check", name]
+    done = subprocess.run(command, cwd=folder, input="b.las\nsub\n", capture_output=True, text=True)
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["b.las", "sub/c.laz"]
 
 
 def test_a_strip_counts_once(folder):

@@ -367,6 +367,16 @@ def test_points_that_would_run_into_the_packets(tmp_path):
     refused(raw.write(tmp_path / "a.las"), "waveform record begins at byte")
 
 
+@pytest.mark.parametrize(("internal", "before"), [(True, "its waveform record begins"), (False, "it ends")])
+def test_points_beyond_the_number_in_the_header_are_named(tmp_path, internal, before):
+    """3 of them were lost without a word."""
+    raw = make_raw(internal=internal)
+    raw.count = len(raw.points) - 3
+    with StripReader(raw.write(tmp_path / "a.las")) as reader:
+        (line,) = reader.facts.warnings
+    assert f"claims {raw.count} points, which leaves room for 3 more before {before}; what is there is not read" in line
+
+
 def test_points_that_would_run_into_the_evlrs(tmp_path):
     raw = make_raw(point_format=9, internal=False)
     raw.behind = bytes(100)
@@ -384,7 +394,7 @@ def test_counts_of_1_4(tmp_path, count):
         return
     with StripReader(path) as reader, reader.scan() as scan:
         assert scan.points == (count or len(raw.points))
-        assert "legacy point count" in reader.facts.warnings[0]
+        assert "legacy point count" in reader.facts.warnings[-1]
 
 
 def test_a_front_that_does_not_fit_memory(tmp_path):

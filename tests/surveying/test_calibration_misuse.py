@@ -1,6 +1,7 @@
 """What contradicts a calibration shows: brightness over the swath, other settings, contradicting options."""
 
 import json
+import shutil
 import struct
 from dataclasses import replace
 from functools import partial
@@ -496,6 +497,9 @@ def test_one_bright_target_and_a_receiver_that_compresses(tmp_path, most, pulse)
     if np.isinf(most):
         assert "compresses" not in said and all(row.relative_error < 0.031 for row in found.channels)
         assert "that its receiver weakens no strong light is assumed" in said
+        shutil.copy(tmp_path / "a.las", tmp_path / "b.las")
+        said = calibrate(tmp_path, strips=["a.las", "b.las"])[1]
+        assert said.count("weakens no strong light") == said.count("a.las (and 1 other): the targets") == 2
         return
     assert "the receiver of digitizer 1 compresses, by the shape of its echoes" in said
     assert "take targets as bright as the surfaces that you measure" in said

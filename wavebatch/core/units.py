@@ -1,6 +1,7 @@
 """Physical and statistical constants that several rooms use, none to be tuned, and numbers with errors as text."""
 
 import math
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 
 C = 0.299792458
@@ -118,3 +119,8 @@ def count(number: int, name: str) -> str:
     if number == 1:
         return f"1 {name}"
     return f"{number} {name}{'es' if name.endswith(('o', 's', 'x', 'ch')) else 's'}"
+
+
+def name_first(names: Sequence[str]) -> str:
+    """`a.las`, `a.las (and 5 others)`: the things that a message is about, if one sentence holds for all of them."""
+    return names[0] + (f" (and {count(len(names) - 1, 'other')})" if len(names) > 1 else "")

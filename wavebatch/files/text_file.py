@@ -112,8 +112,8 @@ def find_files(
 
     A folder gives its LAS and LAZ files by name; recursive: with those of all its subfolders, but not of hidden ones.
     `@list.txt` holds one argument per line, relative to the folder of the list; empty lines and lines that start with #
-    are skipped. A file that does not exist or a folder that cannot be read is kept: it fails in its turn, so that the
-    other files are still processed.
+    are skipped. `@-` is a list from stdin. A file that does not exist or a folder that cannot be read is kept: it fails
+    in its turn, so that the other files are still processed.
     kinds: suffixes of the files that folders and patterns give, kind after kind: the first that is there is taken.
     note: is called with a line about each link to a file that was given before.
     Raises ConfigError if a folder, pattern or list gives no file, or if there is no argument.
@@ -148,7 +148,9 @@ def find_strips(
 
 def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:
     if argument.startswith("@"):
-        path, empty = folder / argument[1:], True
+        path, empty = Path("/dev/stdin") if argument == "@-" else folder / argument[1:], True
+        # A list from a pipe lies in no folder: its names are seen from where the command runs.
+        beside = Path() if path.as_posix().startswith(("/dev/fd/", "/dev/std", "/proc/")) else path.parent
         protect([path])
         for number, line in enumerate(read_text(path, "the list", MOST_LIST).splitlines(), 1):
             entry = line.strip()
@@ -156,7 +158,7 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
                 if entry.startswith("@"):
                     raise ConfigError(f"{path}: line {number}: a list cannot name another list")
                 empty = False
-                yield from _expand(entry, path.parent, recursive, kinds)
+                yield from _expand(entry, beside, recursive, kinds)
         if empty:
             raise ConfigError(f"{path}: the list names no file; write one file, folder or pattern per line")
         return

@@ -104,6 +104,7 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     for what, at in followers.items():
         if start <= at <= header.file_size - las.EVLR_HEADER_SIZE and at < points_end:
             points_end, limit = at, what
+    warnings: tuple[str, ...] = ()
     if not header.compressed:
         room, points_end = points_end, start + header.point_count * header.point_length
         if points_end > room:
@@ -112,11 +113,14 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
                 f"the header claims {header.point_count} points of {header.point_length} bytes from byte {start} on, "
                 f"but {limit} at byte {room}, which leaves room for {(room - start) // header.point_length}",
             )
+        if more := (room - points_end) // header.point_length:
+            # A program that was stopped writes its points, but not their number.
+            warnings = (f"the header claims {header.point_count} points, which leaves room for {more} more before "
+                        f"{limit}; what is there is not read: if points are missing, get the strip again",)  # fmt: skip
     legacy, count = header.counts
-    warnings: tuple[str, ...] = ()
     if header.version >= (1, 4) and legacy and legacy != count:
         used = "64-bit" if count else "legacy"
-        warnings = (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
+        warnings += (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
     return CheckedHeader(path, header.file_size, header, dtype, records, points_end, warnings)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
+from wavebatch.core.units import name_first
 from wavebatch.core.waveforms import angle_across, angle_to_vertical, swath_columns
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import describe_crs
@@ -511,6 +512,10 @@ def _assemble(
         part[:, 3] += [gain.get((found.fingerprint["sha256_sampled"], channel), 0.0) for channel in part[:, 0]]
         places.append(part)
     joined = np.concatenate(places)
+    noted: dict[str, list[str]] = {}
+    for strip in strips:
+        for note in strip.found.notes if strip.found else ():
+            noted.setdefault(note, []).append(strip.path.name)
     return replace(
         good[0],
         constant=float(np.median(constants)),
@@ -528,10 +533,5 @@ def _assemble(
         channels=tuple(channels),
         strips=tuple(rows),
         places=tuple(joined[even_places(len(joined), PLACES)].ravel().tolist()),
-        notes=tuple(
-            note if len(strips) == 1 else f"{strip.path.name}: {note}"
-            for strip in strips
-            if strip.found
-            for note in strip.found.notes
-        ),
+        notes=tuple(note if len(strips) == 1 else f"{name_first(names)}: {note}" for note, names in noted.items()),
     )

@@ -19,7 +19,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.errors import InputError
-from wavebatch.core.units import FWHM_PER_SIGMA, count
+from wavebatch.core.units import FWHM_PER_SIGMA, name_first
 from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.header import decode_text
@@ -372,8 +372,8 @@ def match_strip(
             shares[index] = shares.get(index, 0.0) + share
     named: dict[str, float] = {}
     for problem, shares in problems.items():
-        others = f" (and {count(len(shares) - 1, 'other')})" if len(shares) > 1 else ""
-        named[f"digitizer {min(shares)}{others} {problem}"] = sum(shares.values())
+        which = name_first([f"digitizer {index}" for index in sorted(shares)])
+        named[f"{which} {problem}"] = sum(shares.values())
     if not have & seen.keys():
         raise InputError(
             f"{reader.facts.path}: --calibration: none of the strip's channels is calibrated: {'; '.join(named)}; "

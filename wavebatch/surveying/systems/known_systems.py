@@ -280,9 +280,8 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         if unseen or hidden:
             code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
         elif known and not few:
-            misfit = f"{100 * system.misfit:.2g} % of the amplitude" if system.misfit else "nothing"
-            noise = f"noise of {system.noise.std:.3g} DN"
-            code, guess = "noise-guess", f"{noise} is a guess, and so is what the pulse misses of echoes, {misfit}"
+            guess = f"noise of {system.noise.std:.3g} DN is a guess, as is the pulse's misfit"
+            code, guess = "noise-guess", f"{guess} of {100 * system.misfit:.2g} % of the amplitude"
         yield StripWarning(
             code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
             f"{remedy}",
