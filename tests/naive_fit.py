@@ -139,6 +139,8 @@ def is_resolved(p, errors):
 def decompose(y, std, start, s, clip=np.inf, white=None, **shape):
     """Parameters (3, k), errors and chi2 of one window; s: Settings, whose widths, gates and acceptance count."""
     best = find_echoes(y, std, start, s, clip, white, **shape)
+    if s.grow and best[0].shape[1] > 1:
+        best = join_broad(y, std, best, s, clip, white, **shape)
     return leave_out_unknown(y, std, best, s, clip, white, **shape) if s.known else best
 
 
@@ -153,6 +155,22 @@ def find_echoes(y, std, start, s, clip, white, **shape):
     second = grow(y, std, narrow[0], s, (s.width_low, s.width_high), clip, white, **shape)
     better = second[2] + fall * (second[0].shape[1] - first[0].shape[1]) < first[2]
     return second if better else first
+
+
+def join_broad(y, std, fit, s, clip, white, **shape):
+    """One echo broader than others may be, where it explains the samples as well as all of the fit."""
+    p, _, chi2 = fit
+    share = p[0] * p[2] / np.sum(p[0] * p[2])
+    time = share @ p[1]
+    width = np.sqrt(share @ (p[2] ** 2 + (p[1] - time) ** 2))
+    target = chi2 + (p.shape[1] - 1) * least_fall(p, std, s)
+    if width < s.width_high:
+        return fit
+    one = np.array([[np.sum(p[0] * p[2]) / width], [time], [width]])
+    wide = s._replace(grow=False)
+    widths = s.width_low, max(s.width_high, 100 * s.width_ref)
+    found = grow(y, std, one, wide, widths, clip, white, **shape)
+    return found if found[2] < target else fit
 
 
 def leave_out_unknown(y, std, fit, s, clip, white, **shape):

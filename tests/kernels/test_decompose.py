@@ -146,6 +146,18 @@ def test_candidates_of_nothing_are_left_out():
     assert (found.parameters[:, 0] > 0).all()
 
 
+def test_one_broad_echo_is_taken_where_it_explains_as_much_as_several():
+    """A slope under a wide beam; two echoes as far apart as it is broad stay two."""
+    noise = np.random.default_rng(4).standard_normal((200, LENGTH))
+    start = np.tile(np.array([[90.0, 90.0], [19.0, 29.0], [8.0, 8.0]]), (200, 1, 1))
+    slope, pair = (decompose(np.rint(signal + noise), start, std=1.04, **GROWING)
+                   for signal in (bell(24, 100, 10.0), bell(14, 100, 3.0) + bell(34, 100, 3.0)))  # fmt: skip
+    assert (slope.number == 1).all() and not slope.at_bound.any()
+    off = (slope.parameters[:, :3] - [100.0, 24.0, 10.0]) / slope.errors[:, :3]
+    assert ((np.abs(off) < 1).mean(axis=0) > 0.5).all() and (np.abs(off.mean(axis=0)) < 0.3).all()
+    assert (pair.number >= 2).all() and (pair.number == 2).mean() > 0.97
+
+
 def draw_random(rng):
     """One to three echoes of any strength and distance; one candidate."""
     k = rng.integers(1, 4)
@@ -164,17 +176,25 @@ def draw_crowd(rng):
     return np.stack([np.exp(rng.uniform(4, 9, 4)), 8 + np.cumsum(rng.uniform(3.0, 9.0, 4)), np.full(4, 2.0)])
 
 
+def draw_broad(rng):
+    """A slope under a wide beam: broader than echoes beside others may be."""
+    return np.array([[np.exp(rng.uniform(4, 6))], [24.0], [rng.uniform(9, 12)]])
+
+
 @pytest.mark.quick_cases(
-    "3.0-whitening2-draw_random-inf-learned", "0.0-whitening0-draw_stiff-200.0-gaussian",
+    "0.0-whitening0-draw_broad-inf-learned",
+    "3.0-whitening2-draw_random-inf-learned",
+    "0.0-whitening0-draw_stiff-200.0-gaussian",
 )  # fmt: skip
 @pytest.mark.parametrize("shape", [GAUSSIAN, LEARNED], ids=["gaussian", "learned"])
 @pytest.mark.parametrize(
     ("draw", "clip"),
-    [(draw_random, np.inf), (draw_random, 200.0), (draw_stiff, np.inf), (draw_stiff, 200.0), (draw_crowd, np.inf)],
+    [(draw_random, np.inf), (draw_random, 200.0), (draw_stiff, np.inf), (draw_stiff, 200.0), (draw_crowd, np.inf),
+     (draw_broad, np.inf)],
 )
 @pytest.mark.parametrize(("known", "whitening"), [(0.0, ()), (3.0, ()), (3.0, (1.1, -0.4))])
 def test_clusters_grow_as_those_of_the_twin(shape, draw, clip, known, whitening):
-    rng, m = np.random.default_rng(5), 20 if draw is draw_crowd else 30  # the twin takes long
+    rng, m = np.random.default_rng(5), {draw_crowd: 20, draw_broad: 4}.get(draw, 30)  # the twin takes long
     truth = [draw(rng) for _ in range(m)]
     y = np.stack([naive_fit.naive.model(p, np.arange(float(LENGTH)), components=shape.components) for p in truth])
     noise = rng.standard_normal(y.shape)

@@ -11,6 +11,7 @@ static const double PROVEN = 2;                /* errors of an amplitude whose e
 static const double STEADY = 0.01;             /* misfit below which no pulse is known: from shot to shot those of real sensors
                                                   change by .4 to 1.2 % of the amplitude */
 static const double REACHES = 4;               /* widths from an echo at which its shape is nothing */
+static const double BROADEST = 100;            /* widths of the pulse that one echo may have in place of others, as tables do */
 static const double ROOT_PI = 1.7724538509055161;
 
 /* Amplitudes from 0, times within 3 samples of the window, widths and skews as set. */
@@ -142,6 +143,28 @@ static int decompose_window(const Settings *s, const Clusters *clusters, int64_t
     return 0;
 }
 
+/* One echo in place of all of the best fit, where that explains the samples as well and is broader than echoes may be: on
+   a steep slope a wide beam makes one broad echo, and several that share it are places where nothing is. */
+static void join_broad(const Settings *s, Work *work) {
+    const Solution *best = &work->best;
+    const int64_t k = best->k;
+    const double *a = best->parameters, *t = a + k, *w = t + k;
+    const Prior none = {0};
+    Limits limits = limits_of(s, &work->window);
+    double area = 0, time = 0, square = 0;
+    for (int64_t j = 0; j < k; j++) { area += a[j] * w[j]; time += a[j] * w[j] * t[j]; }
+    if (!(area > 0)) return;
+    time /= area;
+    for (int64_t j = 0; j < k; j++) square += a[j] * w[j] * (w[j] * w[j] + (t[j] - time) * (t[j] - time));
+    const double width = sqrt(square / area);
+    if (width < s->width_high) return;
+    limits.high[2] = fmax(s->width_high, BROADEST * s->width_ref);
+    work->fit.parameters[0] = area / width; work->fit.parameters[1] = time; work->fit.parameters[2] = width;
+    const double target = best->cost + (k - 1) * least_fall(s, k, a, work->window.std);
+    fit_window(1, 3, s, &limits, &none, target, work);
+    if (!work->fit.hopeless && work->fit.converged && work->fit.cost < target) describe_fit(s, &limits, work, &work->best);
+}
+
 /* Errors of the best fit once more, with what is known of its amplitudes. */
 static void renew_errors(const Settings *s, const Prior *prior, Work *work) {
     Solution *best = &work->best;
@@ -256,6 +279,7 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
         if (s->whitened && s->grow) find_new_energy(&work);
         if (decompose_window(s, clusters, i, &work) < 0) { i = -1; break; }
+        if (s->grow && work.best.k > 1) join_broad(s, &work);
         if (s->known > 0) leave_out_unknown(s, &work);
         if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
         if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);

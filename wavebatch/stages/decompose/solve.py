@@ -166,7 +166,8 @@ class EchoLimits:
     least_width : float
         Smallest width of an echo, of the box of Wang et al. eq. 4 [widths of the system pulse].
     most_width : float
-        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
+        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4, which decompose.adaptive
+        gives one echo where several would explain no more.
     """
 
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0
