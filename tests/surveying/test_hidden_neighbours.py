@@ -53,6 +53,14 @@ def test_what_is_hidden_changes_errors_and_no_echo():
     assert 0.5 < max(share for _, *shares in system.hidden_light for share in shares) < 1.3
 
 
+@pytest.mark.parametrize(("scene", "pulses"), [("canopy.corn", 6000), ("forest", 3000)])
+def test_errors_of_widths_hold_what_hidden_neighbours_add(scene, pulses):
+    """Widths of the strip hold them too: pairs drawn from these said too little (lone echoes of corn: 47 %)."""
+    block, truth = simulate_block(scene, pulses, np.random.default_rng(12))
+    plain, _ = scaled_errors(scene, survey_block(block).system, block, truth)
+    assert 0.68 < np.mean(np.abs(plain[3]) < 1) < 0.85
+
+
 def test_a_survey_of_an_earlier_version_is_named(tmp_path):
     """It has no `hidden_light` and `hidden_width`, so that errors are too small in forests: nothing said so."""
     strip, system = tmp_path / "f.las", tmp_path / "f.toml"
@@ -84,7 +92,7 @@ def test_errors_cover_hidden_neighbours(scene):
     assert 0.8 < rms(covered[1][0]) < 1.3
     for kind, before in zip(covered, bare, strict=True):
         within = np.mean(np.abs(kind[1:]) < 1, axis=1)
-        assert (within > 0.6).all() and (within < 0.75).all()
+        assert (within > 0.6).all() and (within < 0.8).all()
         assert all(rms(kind[row]) <= rms(before[row]) for row in (1, 2, 3))
 
 

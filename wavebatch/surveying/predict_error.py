@@ -297,4 +297,6 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     away = np.abs(time[found.waveform] - found.time[:, None])
     nearer = pairs.take(2 * found.waveform + away.argmin(axis=1))
     light = 1.0 - (nearer.amplitude * nearer.sigma).astype(np.float64) / (found.amplitude * found.sigma)
-    return excess_variance(found, system), away.min(axis=1) / ref, light, 1.0 - nearer.sigma / found.sigma
+    # The strip's widths hold hidden neighbours themselves: a target is no wider than the pulse here.
+    widened = 1.0 - np.minimum(nearer.sigma, ref) / found.sigma
+    return excess_variance(found, system), away.min(axis=1) / ref, light, widened
