@@ -396,7 +396,7 @@ def test_widths_with_a_skew_per_echo_are_refused_before_a_run():
 @pytest.mark.parametrize("system", [SYSTEM, LEARNED], ids=["gaussian", "learned"])
 @pytest.mark.parametrize("decomposer", ["adaptive", "reference"])
 def test_steep_slopes_have_angles_where_the_box_of_widths_lets_them(system, decomposer):
-    """70 degrees at 1500 m and 1.1 mrad: six widths of the pulse; all end at the bound of four but those of `adaptive`."""
+    """70 degrees, 1500 m, 1.1 mrad: six widths of the pulse; all end at the bound of four but those of `adaptive`."""
     block = planes(system, 70.0, height=1500.0)
     usual = chain_of(decomposer, "system").run(block, system)
     strongest = usual.amplitude > 20
