@@ -181,8 +181,13 @@ def cut_strip(source: Path, target: Path, points: int) -> Path:
         struct.pack_into("<Q", data, 247, points)
     if struct.unpack_from("<I", data, 107)[0]:
         struct.pack_into("<I", data, 107, points)
+    left_out = (header.point_count - points) * header.point_length
+    end = header.offset_to_points + header.point_count * header.point_length
+    for place in (227, 235)[: data[25] - 2]:  # of the packets in the file, and of EVLRs
+        if at := struct.unpack_from("<Q", data, place)[0]:
+            struct.pack_into("<Q", data, place, at - left_out)
+    del data[end - left_out : end]
     if source.with_suffix(".wdp").exists():
-        data = data[: header.offset_to_points + points * header.point_length]
         target.with_suffix(".wdp").write_bytes(source.with_suffix(".wdp").read_bytes())
     target.write_bytes(data)
     return target

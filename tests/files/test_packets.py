@@ -111,21 +111,33 @@ def test_compression_of_a_descriptor_that_nobody_uses_does_no_harm(tmp_path):
     assert_read(raw.write(tmp_path / "a.las"), raw)
 
 
-def test_neither_place_falls_back_and_says_so(tmp_path):
+@pytest.mark.parametrize(("encoding", "given"), [(0, "no place"), (6, "two places")])
+def test_neither_or_both_places_fall_back_and_say_so(tmp_path, encoding, given):
     raw = make_raw()
-    raw.encoding = 0
+    raw.encoding = encoding
     path = raw.write(tmp_path / "a.las")
     assert_read(path, raw)
     with StripReader(path) as reader:
+        assert f"gives {given} of the packets" in reader.facts.warnings[0]
         assert "read from the record in the file" in reader.facts.warnings[0]
     raw = make_raw(internal=False)
-    raw.encoding = 0
+    raw.encoding = encoding
     path = raw.write(tmp_path / "b.las")
     assert_read(path, raw)
     with StripReader(path) as reader:
         assert "read from b.wdp" in reader.facts.warnings[0]
     path.with_suffix(".wdp").unlink()
     refused(path, "neither in the file nor next to it: put b.wdp")
+
+
+def test_packets_in_the_file_are_read_where_the_header_says_wdp(tmp_path):
+    raw = make_raw(point_format=9)
+    raw.encoding = 4
+    path = raw.write(tmp_path / "a.las")
+    assert_read(path, raw)
+    with StripReader(path) as reader:
+        (line,) = reader.facts.warnings
+    assert "gives a wrong place of the packets" in line and "read from the record in the file" in line
 
 
 def test_records_behind_the_packets_are_no_packets(tmp_path):
@@ -155,7 +167,6 @@ COMPRESSED = [descriptor(1, compression=2)]
     # Of 32 bytes, but 32 samples of 12 bits have 48 or 64.
     ({"vlrs": [descriptor(1, bits=12, samples=32)]},
      "no packet can be used.*neither whole bytes nor packed samples.*with 8, 16 or 32 bits"),
-    ({"encoding": 6}, "bits 1 and 2"),
     *(({"waveform_start": start}, "record") for start in (1, 300, 10**6, 2**63, 2**64 - 1)),
     ({"head": record_head(0, record_id=1234)}, "no waveform record at byte"),
 ])  # fmt: skip

@@ -72,12 +72,6 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
             cloud = "a cloud that wavebatch wrote" if header.generating_software.startswith(b"wavebatch") else "clouds"
             raise InputError(f"{path}: point format {number} has no waveforms, which need format 4, 5, 9 or 10; "
                              f"`wavebatch info` and `stats` read {cloud}")  # fmt: skip
-        both = las.WAVES_INTERNAL | las.WAVES_EXTERNAL
-        if header.global_encoding & both == both:
-            raise InputError(
-                f"{path}: the header claims packets both in the file and in a .wdp (global encoding bits 1 and 2); "
-                "clear the wrong bit in byte 6 of the file"
-            )
     if number not in las.STANDARD_DTYPES:
         raise damaged(path, f"point format {number} is not known")
     if number >= 6 and header.version < (1, 4):
@@ -113,6 +107,8 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
                 f"the header claims {header.point_count} points of {header.point_length} bytes from byte {start} on, "
                 f"but {limit} at byte {room}, which leaves room for {(room - start) // header.point_length}",
             )
+        # Packets may lie in the file although the header says that they do not.
+        room = header.waveform_start if points_end <= header.waveform_start < room else room
         if more := (room - points_end) // header.point_length:
             # A program that was stopped writes its points, but not their number.
             warnings = (f"the header claims {header.point_count} points, which leaves room for {more} more before "

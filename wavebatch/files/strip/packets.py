@@ -152,17 +152,21 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
     header, path = checked.header, checked.path
     if compression and min(compression.values()) > COMPRESSED:
         raise refuse_compressed(path, next(iter(compression.values())))
-    if header.global_encoding & las.WAVES_INTERNAL:
+    said = header.global_encoding & (las.WAVES_INTERNAL | las.WAVES_EXTERNAL)
+    if said == las.WAVES_INTERNAL:
         return _locate_internal(checked)
-    external = header.global_encoding & las.WAVES_EXTERNAL
+    external = said == las.WAVES_EXTERNAL
     packet_file, packed = (
         next(filter(Path.is_file, list_packet_files(path, (f".{end}", f".{end.upper()}"))), None)
         for end in ("wdp", "wdz")
     )
     if COMPRESSED in compression.values() and packed is not None:
         packet_file = packed
-    warning = "the header does not give the place of the packets (global encoding bits 1 and 2)"
-    if header.waveform_start and not external:
+    given = "a wrong place" if external else "two places" if said else "no place"
+    warning = f"the header gives {given} of the packets (global encoding bits 1 and 2)"
+    # Where both bits or none are set, or the .wdp is not there, what is there decides.
+    evlrs = las.find_evlrs(path, header)[0] if external and packet_file is None and packed is None else []
+    if header.waveform_start and (not external or any(one.record_id == las.WAVEFORM_RECORD_ID for one in evlrs)):
         place, where = _locate_internal(checked), "the record in the file"
     elif packet_file is not None:
         place, where = _locate_external(checked, packet_file, headerless), packet_file.name
@@ -178,7 +182,9 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
         raise InputError(f"{path}: its packets are missing: put {name} next to the strip")
     else:
         return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
-    return place if external else replace(place, warnings=(*place.warnings, f"{warning}; they are read from {where}"))
+    if external and not place.internal:
+        return place
+    return replace(place, warnings=(*place.warnings, f"{warning}; they are read from {where}"))
 
 
 def refuse_compressed(path: Path, kind: int) -> InputError:
