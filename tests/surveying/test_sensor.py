@@ -6,6 +6,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
+from facet_strips import EAST, NORTH, START, Facet, Sensor, path_of, write_strip
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import ADJUSTED, Trajectory
@@ -298,6 +299,23 @@ def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
         with pytest.raises(InputError, match=message) as caught:
             find_sensor(reader, replace(scan, vectors=replace(scan.vectors, ratio=ratio)), SensorRequest())
     assert "\n" not in str(caught.value) and "project the strip" in str(caught.value)
+
+
+def test_a_strip_that_is_sorted_by_place_has_the_sensor_at_all_times(tmp_path, edit_points):
+    """Points of tiles, one tile after the other: each place of the file has rays of a short time."""
+    flight, pulses = Sensor(rate=1000.0, n_samples=40), 40_000
+    strip = write_strip(tmp_path / "time.las", [Facet(0.3)], flight, pulses)
+
+    def sort(points):
+        along, across = points["X"] - points["X"].min(), points["Y"] - points["Y"].min()
+        return points[np.lexsort((along, across, across // 80_000, along // 80_000))]
+
+    sorted_by_place = edit_points(strip, tmp_path / "place.las", sort)
+    time = START + np.arange(pulses) / flight.rate
+    positions = find(sorted_by_place).trajectory.at(time)
+    assert np.isfinite(positions).all()
+    true = path_of(flight, time - START) + [EAST, NORTH, 0.0]
+    assert np.sqrt(np.mean((positions - true) ** 2)) < 0.1
 
 
 def test_a_few_rays_of_every_place(wide_strip):

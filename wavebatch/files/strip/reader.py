@@ -416,6 +416,10 @@ SLICE_POINTS, RAYS_PER_SLICE = 2048, 256
 SLICE_SECONDS = 0.5
 """Time [s] after which another place of the same unit is read: an aircraft moves 30 m in it."""
 
+MIXED = 0.05
+"""Share of the points that are earlier than the point before them, from which a file is not sorted by time. Of sorted
+files hardly any is."""
+
 SCALE_PLACES = 16
 """Most places at which distances of returns are compared with their times."""
 
@@ -447,11 +451,12 @@ class RaySample(NamedTuple):
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySample]:
     """Return the rays of a strip from packet vectors, and those from pulses with two returns.
 
-    At most RAYS_PER_SLICE rays at each of about MOST_SLICES places.
+    At most RAYS_PER_SLICE rays at each of about MOST_SLICES places. Of units that are sorted by place, not time, rays
+    from all over the unit are added: each of its places has rays of a short time only.
     """
     kept, pairs = [], []
 
-    def take(start: int, stop: int) -> float:
+    def take(start: int, stop: int) -> tuple[float, bool]:
         points = reader.read_points(start, stop, scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
@@ -468,7 +473,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
         rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
         kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows]))
-        return float(time[0])
+        return float(time[0]), bool(np.count_nonzero(time[1:] < time[:-1]) > MIXED * len(time))
 
     units = _choose_units(scan)
     starts = [take(start, min(start + SLICE_POINTS, stop)) for start, stop in units]
@@ -476,7 +481,10 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
         end = units[-1][1]
         starts.append(take(max(units[-1][0], end - SLICE_POINTS), end))
     share = min(_SLICES_PER_UNIT, MOST_SLICES // max(len(units), 1))
-    for (start, stop), begin, until in zip(units, starts, starts[1:], strict=False):
+    for (start, stop), (begin, is_mixed), (until, _) in zip(units, starts, starts[1:], strict=False):
+        if is_mixed and stop - start > SLICE_POINTS:
+            take(start, stop)
+            continue
         seconds = abs(until - begin)
         number = int(np.clip(np.ceil(seconds / SLICE_SECONDS), 1, share)) if np.isfinite(seconds) else share
         for edge in (start + np.arange(1, number) * ((stop - start) // number)).tolist():
