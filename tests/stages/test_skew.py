@@ -11,7 +11,10 @@ import wavebatch as wb
 from wavebatch import surveying
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.stages.chain import parse_chain
+from wavebatch.surveying.measuring.residuals import decompose_sample
+from wavebatch.surveying.systems import skew
 from wavebatch.tools.compare_chains import measure_fit
 
 LEARNED = ((1.0, 0.0, 2.0), (0.3, 3.0, 2.4), (0.02, 9.0, 2.0))
@@ -136,3 +139,22 @@ def test_a_real_strip_has_the_ratio_of_the_paper(leica):
     gaussian, one = (measure_real(leica, name)[0] for name in ("gaussian", "skewed"))
     free = measure_real(leica, "skewed", kappa="free")[0]
     assert 0.45 < one / gaussian < 0.65 and free <= one * 1.01
+
+
+def test_a_skew_at_its_limit_is_not_one_of_the_strip(monkeypatch):
+    """Where a fit ends at a limit its numbers are those of the limit, not of the echo."""
+    block, _, _ = strip([0.23])
+    echoes = surveying.survey_block(block)
+    found = {}
+    for name in ("at_bound", "converged"):
+
+        def fit(*arguments, name=name):
+            solution, odd = decompose_clusters(*arguments), slice(None, None, 2)
+            solution.parameters[odd, 3] = 0.9
+            getattr(solution, name)[odd] = name == "at_bound"
+            return solution
+
+        monkeypatch.setattr(skew, "decompose_clusters", fit)
+        table = decompose_sample(block, echoes.system)
+        found[name] = skew.measure_skew(block, echoes.system, table)
+    assert found["at_bound"] == found["converged"] and found["at_bound"].skew == pytest.approx(0.23, abs=0.03)

@@ -14,6 +14,7 @@ from wavebatch.stages.chain import load_profile
 from wavebatch.stages.decompose.merge import cover_hidden
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block
+from wavebatch.surveying.measuring.choose_pulse import bear
 from wavebatch.tools.simulate import find_scene, simulate_block
 
 ACCURATE = load_profile("accurate")
@@ -136,3 +137,10 @@ def test_the_cover_is_that_of_a_loop(rng):
     assert np.array_equal(earlier.time_err, covered.time_err)
     assert all(np.array_equal(getattr(earlier, name), getattr(table, name)) for name in ("amplitude_err", "sigma_err"))
     assert cover_hidden(table, replace(system, hidden=()), 40) is table
+
+
+def test_pulses_are_judged_without_what_is_hidden():
+    """Errors that hold neighbours belong to one pulse of a survey: with them another pulse is not compared alike."""
+    known = {"hidden": ((1.0, 0.1),), "hidden_light": ((1.0, 0.1, 0.2),), "hidden_width": ((1.0, 0.1, 0.2),)}
+    borne = bear(SystemPulse(sigma_ref=2.0, **known), 0.05)
+    assert (borne.hidden, borne.hidden_light, borne.hidden_width) == ((), (), ()) and borne.misfit > 0

@@ -14,8 +14,10 @@ from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.pulse_tables import noise_factors, pulse_shape
 from wavebatch.stages.score import match_echoes
-from wavebatch.surveying import survey_block
-from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
+from wavebatch.surveying import survey, survey_block
+from wavebatch.surveying.measuring.noise_and_width import DITHERED
+from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample
+from wavebatch.surveying.measuring.whitening import _list_lower, choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import simulate_again
 
 SIGMA, NOISE, LENGTH, RHO = 2.0, 3.0, 80, 0.8
@@ -144,3 +146,30 @@ def test_weak_echoes_are_taken_off_the_noise_and_slow_noise_is_not(kind, lowered
     found = lower_noise(block, SystemPulse(sigma_ref=width, noise=noise))
     assert (found.std < 0.95 * noise.std) == lowered and (found is noise) == (not lowered)
     assert found.std >= 1.1 and noise.std > 1.5
+
+
+@pytest.mark.parametrize(("quiet", "least"), [(0.2, DITHERED), (0.6, 0.6)])
+def test_less_noise_is_never_less_than_rounding_makes(quiet, least):
+    """Counts that hardly change say nothing of a noise below what rounding adds to it."""
+    noise = ReceiverNoise(baseline=200.0, std=0.43 if quiet < DITHERED else 0.63, by_kind={"quiet": quiet})
+    lower = list(_list_lower(SystemPulse(sigma_ref=SIGMA, noise=noise), 1.0))
+    assert [one.std for one in lower] == [least]
+
+
+def test_with_less_noise_echoes_are_found_again(monkeypatch):
+    """What follows in the survey is of the noise that is left, as its pulse is."""
+    block, _ = record(400, (100.0, 14.0), 6.0)
+    seen = []
+
+    def look(part, system, borne, echoes):
+        seen.append((part, system, borne, echoes))
+        return decompose_again(part, system, borne, echoes)
+
+    monkeypatch.setattr(survey, "lower_noise", lambda part, system: replace(system.noise, std=0.5 * system.noise.std))
+    monkeypatch.setattr(survey, "decompose_again", look)
+    decisions = survey.survey_block(block).decisions
+    assert any(one.part == "noise without hidden echoes" and one.needed for one in decisions)
+    part, system, borne, echoes = seen[-1]
+    again = decompose_sample(part, borne)
+    assert borne.noise.std == system.noise.std
+    assert len(again) == len(echoes) and np.array_equal(again.amplitude, echoes.amplitude)

@@ -98,3 +98,9 @@ def test_what_is_not_known_of_level_ground_is_in_the_error_of_every_angle(level_
     unsure = replace(sharp, widths=replace(sharp.widths, error=0.2))
     flat, given = (tabulate_angles(one, 1.0, 700.0, 0.5, 1000.0) for one in (sharp, unsure))
     assert (given.error[10:70] > 2 * flat.error[10:70]).all()
+
+
+def test_a_picture_of_angles_is_refused_before_the_survey(riegl, tmp_path, monkeypatch):
+    monkeypatch.setattr("wavebatch.cli.survey._survey", None)  # nothing is surveyed
+    refused = run(riegl, "--divergence", 0.5, "--angles", tmp_path / "a.bmp")
+    assert refused.exit_code == 2 and "a.bmp" in refused.stderr and ".svg" in refused.stderr, refused.output

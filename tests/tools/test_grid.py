@@ -1,5 +1,6 @@
 """`wavebatch grid`: every cell equals a plain count, in bounded memory; GDAL reads place, CRS, units and no-data."""
 
+import json
 import struct
 
 import laspy
@@ -223,3 +224,16 @@ def test_counts_of_two_digitizers_in_one_raster_are_named(tmp_path):
     said = grid("amplitude", "a", "b")
     assert "warning: amplitude: counts of" in said and "(8 bits, 1 ns apart)" in said and "(16 bits, 1 ns" in said
     assert "counts of" not in grid("amplitude", "a", "c") + grid("echo_width", "a", "b")
+
+
+@pytest.mark.parametrize(("first", "named"), [(12, False), (8, True)])
+def test_counts_of_two_digitizers_are_named(rng, tmp_path, first, named):
+    """A cloud of two runs has the counts of the last one; before it another strip may have been the input."""
+    for name, bits in (("a.las", (8, first)), ("b.las", (16, 12))):
+        texts = [json.dumps({"survey": {"figures": {"bits": one, "spacing_ns": 1.0}}}).encode() for one in bits]
+        runs = [laspy.VLR("wavebatch", number, "", text) for number, text in enumerate(texts, 1)]
+        write_points(tmp_path / name, rng.uniform(0, 50, (99, 3)), extra=[("high", "f4", -9999.0, None, "peak [DN]")],
+                     vlrs=runs, high=np.ones(99, np.float32))  # fmt: skip
+    result = _run(tmp_path / "a.las", tmp_path / "b.las", "--column", "high", "--size", 5, "-o", tmp_path / "x.tif")
+    words = f"warning: high: counts of {tmp_path / 'a.las'} (8 bits, 1 ns apart) and {tmp_path / 'b.las'} (12 bits"
+    assert (words in result.stderr) == named and ("do not compare" in result.stderr) == named
