@@ -12,7 +12,7 @@ import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -277,7 +277,7 @@ MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
 
-def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
+def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...], list[str]]:
     """Find what a user should know about a strip that is written.
 
     Parameters
@@ -288,10 +288,12 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
 
     Returns
     -------
-    tuple of str
+    remarks : tuple of str
         One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
         hardly measure; a trajectory that contradicts the vectors, or
         that does not cover the strip; changes of energy that nothing shows.
+    missed : list of str
+        The same of columns that --columns names, for `find_warnings`.
     """
     lines = [*prepared.scan.notes, *name_gains(prepared.facts, prepared.scan)]
     lines += filter(None, [prepared.sensor.doubt()])
@@ -378,7 +380,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
             "value: leave these points out before a mean (flag ADDED)"
         )
-    return (*lines, *_explain_columns(prepared, report)[0])
+    few, missed = _explain_columns(prepared, report)
+    return (*lines, *few), missed
 
 
 def _explain_columns(prepared: Prepared, report: RunReport) -> tuple[list[str], list[str]]:
@@ -392,25 +395,25 @@ def _explain_columns(prepared: Prepared, report: RunReport) -> tuple[list[str], 
         if column not in wanted:
             continue
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
+        outlook = _look_out(prepared, report) if column == _ANGLE else None
         if total and not known:
             first = max(NoData, key=lambda reason: (counts.get(reason.name, 0), -reason))
             meaning, remedy = REASONS[first]
             share = f"{counts[first.name]} of them: " if counts[first.name] < total else ""
-            if column == _ANGLE and first in (NoData.UNCERTAIN, NoData.SHORT_PULSE, NoData.TOO_STEEP):
-                outlook = _look_out(prepared, report)
-                meaning = f"{meaning}: {outlook.reason}" if outlook is not None else meaning
+            if outlook is not None and first in (NoData.UNCERTAIN, NoData.SHORT_PULSE, NoData.TOO_STEEP):
+                meaning = f"{meaning}: {outlook.reason}"
             (missed if column in asked else lines).append(
                 f"{column}: none of {total} echoes has one; {share}{meaning}; {remedy}"
             )
-        elif total and column == _ANGLE:
-            outlook = _look_out(prepared, report)
-            if outlook is not None and not outlook.possible:
-                remedy = REASONS[NoData.UNCERTAIN][1]
-                lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
+        elif total and outlook is not None and not outlook.possible:
+            remedy = REASONS[NoData.UNCERTAIN][1]
+            lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
     return lines, missed
 
 
-def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, str]) -> tuple[StripWarning, ...]:
+def find_warnings(
+    prepared: Prepared, report: RunReport, missed: Sequence[str], dropped: Mapping[str, str]
+) -> tuple[StripWarning, ...]:
     """Find what makes results of a strip doubtful.
 
     Parameters
@@ -418,6 +421,8 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
     prepared : Prepared
     report : RunReport
         Of the whole strip.
+    missed : sequence of str
+        From `find_remarks`.
     dropped : mapping of str to str
         Records of the input that the cloud does not have, and why.
 
@@ -493,7 +498,7 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
             f"survey's pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
         )
         found += warn("false-echoes", [line])
-    found += warn("no-value", _explain_columns(prepared, report)[1])
+    found += warn("no-value", missed)
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
 

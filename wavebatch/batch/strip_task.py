@@ -252,7 +252,7 @@ class StripTask:
         options, job, prepared, writer = self._options, self.job, self.ready, _given(self._writer)
         start = Seconds.now()
         self._report.check(job.options.points, str(job.path))
-        remarks = find_remarks(prepared, self._report)
+        remarks, missed = find_remarks(prepared, self._report)
         if prepared.stranger:
             words = "does not belong to the flight that was surveyed"
             remarks = (f"{words}: {prepared.stranger}; it was surveyed alone", *remarks)
@@ -264,7 +264,7 @@ class StripTask:
         replaces = options.overwrite or options.resume
         size = writer.complete()
         self._report += RunReport(timing={"publish": Seconds.now() - start})
-        warnings = find_warnings(prepared, self._report, writer.dropped)
+        warnings = find_warnings(prepared, self._report, missed, writer.dropped)
         self._report = replace(self._report, warnings=warnings)
         document = report_file.build_document(prepared, self._described, self._report, cloud, size)
         draft = draft_text(report, report_file.format_report(document), overwrite=replaces)
