@@ -461,6 +461,17 @@ def geo_keys(**values):
     return [Vlr(b"LASF_Projection", 34735, struct.pack(f"<{len(flat)}H", *flat))]
 
 
+@pytest.mark.parametrize(
+    ("code", "name", "meridian", "northing"),
+    [(32601, "WGS 84 / UTM zone 1N", -177, 0), (32760, "WGS 84 / UTM zone 60S", 177, 10000000),
+     (25832, "ETRS89 / UTM zone 32N", 9, 0), (26910, "NAD83 / UTM zone 10N", -123, 0)],
+)  # fmt: skip
+def test_utm_zones(code, name, meridian, northing):
+    text = build_utm(code)
+    assert text.startswith(f'PROJCS["{name}"') and text.endswith(f'AUTHORITY["EPSG","{code}"]]')
+    assert f'"central_meridian",{meridian}]' in text and f'"false_northing",{northing}]' in text
+
+
 @pytest.mark.parametrize("code", [32600, 32661, 25827, 25839, 26924, 31468, 4326, 0])
 def test_other_codes_are_not_guessed(code):
     assert build_utm(code) is None

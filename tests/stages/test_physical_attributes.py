@@ -440,3 +440,14 @@ def test_the_light_of_a_generalized_echo_is_its_integral(power):
     area = np.sum(np.exp(-0.5 * np.abs(time / unit) ** power)) / np.sum(np.exp(-0.5 * (time / 3.0) ** 2))
     echoes = EchoTable.build([0], [20.0], [50.0], [3.0]).with_attributes(power=np.array([power], np.float32))
     assert echo_light(block, SYSTEM, echoes) == pytest.approx([150.0 * area], rel=2e-4)
+
+
+def test_only_echoes_alone_have_a_reflectance_and_an_angle():
+    """Several targets share the light of a pulse: none says how much of it the others had."""
+    block, echoes, _ = make(np.full(40, 30.0), per_waveform=2)
+    done = run(block, echoes, SYSTEM, *NAMES).attributes
+    for name in ("level_reflectance", "level_reflectance_err", "incidence_angle"):
+        assert np.isnan(done[name]).all(), name
+    assert (done["level_reflectance_reason"] == NoData.SHARED_PULSE).all() and np.isfinite(done["cross_section"]).all()
+    done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"alone": False}).attributes
+    assert np.isfinite(done["incidence_angle"]).all()

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, NamedTuple, Protocol
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -57,26 +57,9 @@ class Area(NamedTuple):
 OUTSIDE = Area("outside", "outside")
 
 
-class Division(Protocol):
-    """A division of the plane into areas that do not overlap."""
-
-    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The number of the area of each position (n,), i8; -1 outside of all areas."""
-
-    def describe(self, number: int) -> Area:
-        """The area with this number."""
-
-    def place(self, cloud: Path) -> Division:
-        """The division in the coordinates of a cloud."""
-        return self
-
-    def miss(self, cloud: Path) -> str:
-        """Says that no area lies in the cloud, once it is placed; empty where one does."""
-        return ""
-
-
-class AreaGrid(Division):
-    """Square cells whose borders are multiples of `size`, in the unit of the coordinates."""
+class AreaGrid:
+    """A division of the plane into square cells whose borders are multiples of `size`, in the unit of the coordinates.
+    """
 
     def __init__(self, size: float) -> None:
         if not (np.isfinite(size) and size > 0):
@@ -84,7 +67,10 @@ class AreaGrid(Division):
         self.size = float(size)
 
     def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """As Division.find; ConfigError if the cells are too small to be numbered at these coordinates."""
+        """The number of the area of each position (n,), i8; -1 outside of all areas.
+
+        Raises ConfigError if the cells are too small to be numbered at these coordinates.
+        """
         with np.errstate(over="ignore", invalid="ignore"):
             known = (np.abs([x, y]) < _FARTHEST).all(axis=0)
             place = np.floor(np.stack([x, y]) / self.size)
@@ -94,21 +80,29 @@ class AreaGrid(Division):
         return np.where(known, (column << 31) | row, _OUTSIDE)
 
     def describe(self, number: int) -> Area:
-        """As Division.describe."""
+        """The area with this number of `find`."""
         if number == _OUTSIDE:
             return OUTSIDE
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
+    def place(self, cloud: Path) -> AreaGrid:
+        """The division in the coordinates of a cloud."""
+        return self
 
-class PolygonSet(Division):
-    """Polygons; where polygons overlap, a position belongs to the first one."""
+    def miss(self, cloud: Path) -> str:
+        """Says that no area lies in the cloud, once it is placed; empty where one does."""
+        return ""
+
+
+class PolygonSet:
+    """A division into polygons; where polygons overlap, a position belongs to the first one."""
 
     def __init__(self, polygons: Sequence[Polygon]) -> None:
         self.polygons = tuple(polygons)
 
     def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """As Division.find."""
+        """As AreaGrid.find."""
         found = np.full(len(x), _OUTSIDE, np.int64)
         for number, polygon in enumerate(self.polygons):
             free = np.flatnonzero(found == _OUTSIDE)
@@ -116,18 +110,20 @@ class PolygonSet(Division):
         return found
 
     def describe(self, number: int) -> Area:
-        """As Division.describe."""
+        """As AreaGrid.describe."""
         return OUTSIDE if number == _OUTSIDE else Area("polygon", self.polygons[number].name)
 
     def place(self, cloud: Path) -> PolygonSet:
-        """As Division.place; raises as `Polygon.place`."""
+        """As AreaGrid.place; raises as `Polygon.place`."""
         header = read_header(cloud)
         return PolygonSet([polygon.place(cloud, header) for polygon in self.polygons])
 
     def miss(self, cloud: Path) -> str:
-        """As Division.miss."""
+        """As AreaGrid.miss."""
         return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
+
+Division = AreaGrid | PolygonSet
 
 AREA_RANKS = ("1-2", "2-3", "3-4", "4-")
 """Classes of pairs of consecutive returns per area and of dead zones.
