@@ -100,14 +100,19 @@ main()
 """
 
 
+def _end_run(strip, folder, code, *options):
+    """A run that its code interrupts says so, and leaves nothing."""
+    process = _start(["run", strip, "-o", folder, "--profile", "fast", *options], code=code)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 130 and said.startswith("interrupted: finished clouds are complete"), said
+    assert list(folder.iterdir()) == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_run_that_reaches_its_limit_of_processor_time_leaves_nothing(strip, tmp_path, jobs):
     """The parent process counts in vain until its limit; the limit holds for each process."""
-    process = _start(["run", strip, "-o", tmp_path, "--profile", "fast", "--jobs", jobs], code=_COUNTING)
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 130 and said.startswith("interrupted: finished clouds are complete"), said
-    assert list(tmp_path.iterdir()) == []
+    _end_run(strip, tmp_path, _COUNTING, "--jobs", jobs)
 
 
 _IN_COMPRESSOR = """
@@ -128,10 +133,7 @@ main()
 @pytest.mark.quick_cases("SIGTERM")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_inside_the_compressor_is_not_taken_for_a_failed_write(strip, tmp_path, name):
-    process = _start(["run", strip, "-o", tmp_path, "--profile", "fast"], code=_IN_COMPRESSOR.format(name=name))
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 130 and said.startswith("interrupted: finished clouds are complete"), said
-    assert list(tmp_path.iterdir()) == []
+    _end_run(strip, tmp_path, _IN_COMPRESSOR.format(name=name))
 
 
 def test_ctrl_c_inside_the_compressor_reaches_a_program_that_uses_the_library(strip, tmp_path, monkeypatch):
@@ -174,10 +176,7 @@ main()
 
 
 def test_an_interrupt_that_python_drops_is_seen_by_the_loop(strip, tmp_path):
-    process = _start(["run", strip, "-o", tmp_path, "--profile", "fast"], code=_LOST)
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 130 and "interrupted: finished" in said
-    assert list(tmp_path.iterdir()) == []
+    _end_run(strip, tmp_path, _LOST)
 
 
 _IN_START = """

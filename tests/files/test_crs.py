@@ -285,24 +285,25 @@ def test_geocentric_coordinates_are_told_by_their_size(middle, geocentric):
 def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
     raw = make_raw(60)
     raw.vlrs = [descriptor(1), *records]
-    strip = raw.write(tmp_path / "s.las")
-    content = bytearray(strip.read_bytes())
-    struct.pack_into("<3d", content, 155, 4_194_000.0, 1_162_000.0, 4_647_000.0)
-    struct.pack_into("<6d", content, 179, 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3)
-    strip.write_bytes(content)
-    arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
+    bounds = 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3
+    arguments = _move(raw, tmp_path, 155, (4_194e3, 1_162e3, 4_647e3), bounds)
     done = run_command(*arguments, "--flight-height", "500")
     assert done.exit_code == 4 and "coordinates are geocentric" in done.stderr
     assert run_command(*arguments).exit_code == 0
 
 
-def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
-    strip = make_raw(200).write(tmp_path / "s.las")
+def _move(raw, folder, at, numbers, bounds):
+    """The arguments of a run of a strip whose header has other offsets (at 155), or scales (131), and other bounds."""
+    strip = raw.write(folder / "s.las")
     content = bytearray(strip.read_bytes())
-    struct.pack_into("<3d", content, 131, 1e-7, 1e-7, 0.001)
-    struct.pack_into("<6d", content, 179, 15.7, 15.6, 48.7, 48.6, 400.0, 300.0)
+    struct.pack_into("<3d", content, at, *numbers)
+    struct.pack_into("<6d", content, 179, *bounds)
     strip.write_bytes(content)
-    arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
+    return "run", strip, "-o", folder / "out", "--profile", "fast"
+
+
+def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
+    arguments = _move(make_raw(200), tmp_path, 131, (1e-7, 1e-7, 0.001), (15.7, 15.6, 48.7, 48.6, 400.0, 300.0))
     done = run_command(*arguments)
     assert done.exit_code == 4 and "coordinates are degrees, packet vectors metres" in done.stderr
     assert run_command(*arguments, "--points", "returns").exit_code == 0

@@ -10,29 +10,28 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
 
 
+def _copy(strip, target):
+    """A copy of a strip and its packets that may be changed."""
+    for path in strip.parent.glob(f"{strip.stem}.[lw][ad][spz]"):
+        target.with_suffix(path.suffix).write_bytes(path.read_bytes())
+    return target
+
+
 @pytest.fixture(scope="module")
 def packed_once(riegl, tmp_path_factory):
     """The RIEGL strip with compressed packets: the encoder of the tests is slow."""
     folder = tmp_path_factory.mktemp("packed")
-    for suffix in (".las", ".wdp"):
-        (folder / f"plain{suffix}").write_bytes(riegl.with_suffix(suffix).read_bytes())
-    return pack_strip(folder / "plain.las", folder / "packed.las")
+    return pack_strip(_copy(riegl, folder / "plain.las"), folder / "packed.las")
 
 
 @pytest.fixture
 def packed(packed_once, tmp_path):
-    """A copy of it that may be changed."""
-    for suffix in (".las", ".wdz"):
-        (tmp_path / f"packed{suffix}").write_bytes(packed_once.with_suffix(suffix).read_bytes())
-    return tmp_path / "packed.las"
+    return _copy(packed_once, tmp_path / "packed.las")
 
 
 @pytest.fixture
 def plain(riegl, tmp_path):
-    """A copy of the RIEGL strip that may be changed."""
-    for suffix in (".las", ".wdp"):
-        (tmp_path / f"plain{suffix}").write_bytes(riegl.with_suffix(suffix).read_bytes())
-    return tmp_path / "plain.las"
+    return _copy(riegl, tmp_path / "plain.las")
 
 
 def _read(path):

@@ -104,11 +104,15 @@ def forest(tmp_path_factory):
     return folder / "forest.las", folder / "truth.npz"
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize(("scene", "least", "most"), [("flat", 0.997, 1.01), ("forest", 0.995, 1.01)])
-def test_energy_is_that_of_the_echoes(scene, least, most, seed):
+@pytest.mark.parametrize(
+    ("scene", "method", "seed", "least", "most"),
+    [*(("flat", "richardson_lucy", seed, 0.997, 1.01) for seed in (1, 2, 3)),
+     *(("forest", "richardson_lucy", seed, 0.995, 1.01) for seed in (1, 2, 3)),
+     ("flat", "gold", 4, 0.97, 1.06), ("flat", "wiener", 4, 0.97, 1.06)],
+)  # fmt: skip
+def test_energy_is_that_of_the_echoes(scene, method, seed, least, most):
     block, truth = simulate_block(scene, 3000, np.random.default_rng(seed))
-    profiles = deconvolve_block(block, SYSTEM, Deconvolution())
+    profiles = deconvolve_block(block, SYSTEM, Deconvolution(method))
     energy = profiles.value.sum() * profiles.area
     assert least < energy / np.sum(truth.amplitude * truth.sigma * SQRT_2PI) < most
 
@@ -135,14 +139,6 @@ def test_a_learned_pulse_ends_where_nothing_was_measured():
     lag = np.flatnonzero(taps) - len(taps) // 2
     assert lag.min() == -9 and lag.max() == 40 and taps.max() == pytest.approx(1.0, abs=0.01)
     assert area == pytest.approx(taps.sum())
-
-
-@pytest.mark.parametrize("method", ["gold", "wiener"])
-def test_energy_is_kept_by_every_method(method):
-    block, truth = simulate_block("flat", 2000, np.random.default_rng(4))
-    profiles = deconvolve_block(block, SYSTEM, Deconvolution(method))
-    energy = profiles.value.sum() * profiles.area
-    assert 0.97 < energy / np.sum(truth.amplitude * truth.sigma * SQRT_2PI) < 1.06
 
 
 @pytest.mark.parametrize("seed", [5, 6])

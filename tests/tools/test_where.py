@@ -14,6 +14,7 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.pairing import compare_clouds
 from wavebatch.tools.plots.draw_cloud import count_values
 from wavebatch.tools.return_stats import count_returns
+from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 TEXT = "number_of_returns >= 2 and echo_width < 5"
 CHOSEN = PointFilter.build(where=TEXT)
@@ -55,6 +56,25 @@ def test_histograms_count_them(cloud, split):
     assert (found.total.points, found.total.left_out) == (total, total - number)
     assert found.total.values == wanted.total.values
     np.testing.assert_array_equal(found.counts, wanted.counts)
+
+
+@pytest.mark.parametrize("unit_points", [None, 100])
+def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path, edit_points, unit_points):
+    """Both parts make the whole, also where the second return of a packet stands in a later unit."""
+    strip = tiny_strip
+    if unit_points:
+        order = lambda points: points[np.argsort(points["bit_fields"] & 7, kind="stable")]  # noqa: E731
+        strip = edit_points(tiny_strip, tmp_path / "s.las", order)
+    whole, several, single, second, none = (
+        voxelize_strip(strip, tmp_path / f"{number}.npz", VoxelOptions(2.0, chosen=PointFilter.build(where=where)),
+                       unit_points=unit_points)
+        for number, where in enumerate((None, "number_of_returns >= 2", "number_of_returns < 2", "return_number == 2",
+                                        "z > 1e6"))
+    )  # fmt: skip
+    assert 0 < several.waveforms < whole.waveforms == several.waveforms + several.left_out
+    assert several.waveforms + single.waveforms == whole.waveforms and second.waveforms == several.waveforms
+    assert several.energy + single.energy == pytest.approx(whole.energy, rel=1e-6)
+    assert (none.waveforms, none.voxels) == (0, 0) and none.left_out == whole.waveforms
 
 
 def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
