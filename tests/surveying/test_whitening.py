@@ -168,7 +168,7 @@ def test_with_less_noise_echoes_are_found_again(monkeypatch):
     monkeypatch.setattr(survey, "lower_noise", lambda part, system: replace(system.noise, std=0.5 * system.noise.std))
     monkeypatch.setattr(survey, "decompose_again", look)
     decisions = survey.survey_block(block).decisions
-    assert any(one.part == "noise without hidden echoes" and one.needed for one in decisions)
+    assert any(one.part == "echoes hidden in the noise" and one.needed for one in decisions)
     part, system, borne, echoes = seen[-1]
     again = decompose_sample(part, borne)
     assert borne.noise.std == system.noise.std
