@@ -169,6 +169,9 @@ SAME_RAY = 0.1
 _CELLS = 2**20
 """Cells of Surroundings on either side of its first point, along each axis: their number has 63 bits."""
 
+_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Odd factors that make one number of 64 bits of three, or a lot of one."""
+
 _LARGEST_CHUNK = 4096
 """Points that are handled at a time at most."""
 
@@ -207,18 +210,18 @@ def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
     -------
     bool (n,)
     """
-    side = radius / FINENESS
-    cell = [np.floor(xyz[:, axis] / side) for axis in range(3)]
-    lot = row.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    order = np.lexsort((lot, *cell))
-    new = np.zeros(len(order), bool)
-    new[:1] = True
-    for values in cell:
-        new[1:] |= values[order[1:]] != values[order[:-1]]
-    start = np.flatnonzero(new)
-    rank = np.arange(len(order)) - np.repeat(start, np.diff(np.append(start, len(order))))
-    kept = np.zeros(len(order), bool)
-    kept[order[rank < MOST_PER_CELL]] = True
+    cell = np.floor(xyz / (radius / FINENESS)).astype(np.int64).view(np.uint64)
+    number = cell[:, 0] * _MIX[0] + cell[:, 1] * _MIX[1] + cell[:, 2] * _MIX[2]  # no two cells have one
+    order = np.argsort(number)
+    number = number[order]
+    start = np.flatnonzero(np.append(True, number[1:] != number[:-1])) if len(order) else np.empty(0, np.int64)
+    count = np.diff(np.append(start, len(order)))
+    full = np.flatnonzero(np.repeat(count > MOST_PER_CELL, count))
+    lot = row[order[full]].astype(np.uint64) * _MIX[0]
+    by_lot = np.lexsort((lot, number[full]))
+    rank = (np.arange(len(order)) - np.repeat(start, count))[full]
+    kept = np.ones(len(order), bool)
+    kept[order[full[by_lot]]] = rank < MOST_PER_CELL
     return kept
 
 

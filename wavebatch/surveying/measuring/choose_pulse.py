@@ -296,19 +296,20 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
 def _try_changes(block: WaveformBlock, found: list[Candidate]) -> list[Candidate]:
     """Candidates, each with the change of its shape that serves it better: that of the best one, or as it was."""
     best = min(found, key=lambda one: one.typical)
-    tuned = {best.name: _find_change(block, best)}
+    tuned = {best.name: _find_change(block, {best.change: best})}
     rivals = [one for one in found if one is not best and one.exceeds(best) < HOPELESS]
-    change = tuned[best.name].change
+    change, judged = tuned[best.name].change, {}
     for one in rivals:
         other = one if one.change == change else _judge(block, one.name, one.system, change, known=one.known)
         tuned[one.name] = min(one, other, key=lambda each: each.typical)
+        judged[one.name] = {one.change: one, other.change: other}
     first = min(tuned.values(), key=lambda one: one.typical)
     if first.name != best.name:
-        tuned[first.name] = _find_change(block, first)
+        tuned[first.name] = _find_change(block, judged[first.name])
     return [tuned.get(one.name, one) for one in found]
 
 
-def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
+def _find_change(block: WaveformBlock, judged: Mapping[float, Candidate]) -> Candidate:
     """The pulse with the least change of shape that no other one beats by HINT, of those that its echoes show.
 
     Its length is that with the best change: by that of the least one, which was within HINT of it or not, two pulses
@@ -317,11 +318,11 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
     Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
     """
     tried: list[Candidate] = []
+    some = next(iter(judged.values()))  # of this pulse, by its changes
     for change in CHANGES:
         if len(tried) > 2 and tried[-1].exceeds(tried[-2]) > SURE:
             break  # more of it loses more echoes
-        same = change == judged.change
-        tried.append(judged if same else _judge(block, judged.name, judged.system, change, known=judged.known))
+        tried.append(judged.get(change) or _judge(block, some.name, some.system, change, known=some.known))
     tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
     found = next(one for one in tried if one.exceeds(best) < HINT)

@@ -15,7 +15,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import median, quantiles
 from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.describe import (
     SampleNoise,
@@ -69,9 +69,7 @@ def explain(
 
     Errors are those of noise alone: else a larger misfit would make every description shorter.
     """
-    block = clean_block(block, system)
-    noise = pooled_noise(block, system)
-    echoes = adaptive(block, noise, system, detect(block, noise, system), **options)
+    block, noise, echoes = find_echoes(block, system, detect, **options)
     echoes = scale_errors(echoes, 1 / misfit_factor(echoes, system, block.spacing))
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
     whole = np.stack([echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1)
@@ -84,6 +82,15 @@ def explain(
     left = np.where(used, block.samples - noise.level - model, np.float32(0))
     left[(block.samples <= floor_level(system)) & (left > 0)] = 0  # an undershoot that was cut off is as any model says
     return Explained(echoes, Sums(shape, count_echoes(echoes.waveform, n), main, left, model, used))
+
+
+def find_echoes(
+    block: WaveformBlock, system: SystemPulse, detect: Callable[..., EchoTable] = matched_filter, **options: float
+) -> tuple[WaveformBlock, Noise, EchoTable]:
+    """As `explain`, without what echoes leave: the block as it was decomposed, its noise, echoes with all errors."""
+    block = clean_block(block, system)
+    noise = pooled_noise(block, system)
+    return block, noise, adaptive(block, noise, system, detect(block, noise, system), **options)
 
 
 def find_changed(one: Explained, other: Explained) -> np.ndarray:

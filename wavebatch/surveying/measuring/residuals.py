@@ -89,7 +89,9 @@ def decompose_again(block: WaveformBlock, system: SystemPulse, before: SystemPul
     return echoes if alike else decompose_sample(block, system)
 
 
-def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+def subtract_echoes(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, model: np.ndarray | None = None
+) -> np.ndarray:
     """What fitted echoes leave of their waveforms.
 
     Parameters
@@ -100,6 +102,8 @@ def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable
         Its pulse is the one that was fitted.
     echoes : EchoTable
         All echoes of the block.
+    model : float32 (n, s), optional
+        These echoes by `render_own`, where they are drawn.
 
     Returns
     -------
@@ -109,7 +113,7 @@ def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable
     """
     noise = pooled_noise(block, system)
     residual = block.samples - noise.level
-    residual -= render_own(block, system, echoes, echoes.waveform, len(block))
+    residual -= render_own(block, system, echoes, echoes.waveform, len(block)) if model is None else model
     residual[(block.samples >= clip_level(block, system)) & (residual < 0)] = 0.0
     residual[(block.samples <= floor_level(system)) & (residual > 0)] = 0.0
     if block.missing is not None:
@@ -161,7 +165,7 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     rows = np.arange(len(alone), dtype=np.int32)
     part = block.rows(alone.waveform)
     model = render_own(block, system, alone, rows, len(alone))
-    residual = subtract_echoes(part, system, replace(alone, waveform=rows.astype(np.int32)))
+    residual = subtract_echoes(part, system, replace(alone, waveform=rows.astype(np.int32)), model)
     lag = (np.arange(s) - time[:, None]) / width[:, None]
     lag[~np.isfinite(residual)] = np.inf
     kinds = dict(system.noise.by_kind)

@@ -12,7 +12,15 @@ from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.stages.pulse_tables import noise_factors, pulse_shape, shape_limits
-from wavebatch.surveying.measuring.judge import SURE, Explained, count_errors, describe_waveforms, exceed, explain
+from wavebatch.surveying.measuring.judge import (
+    SURE,
+    Explained,
+    count_errors,
+    describe_waveforms,
+    exceed,
+    explain,
+    find_echoes,
+)
 from wavebatch.surveying.measuring.mirror import look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import DITHERED, FEW, UNDITHERED, find_single, thin_samples
 
@@ -126,7 +134,7 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     explained = explain(block, plain)
     echoes = explained.echoes
     lone = echoes.waveform[find_single(echoes, len(block), system, STRONG)]
-    left = explain(block.rows(lone), whitened, max_echoes=1).echoes.residual.astype(np.float64) ** 2
+    left = find_echoes(block.rows(lone), whitened, max_echoes=1)[2].residual.astype(np.float64) ** 2
     if len(left) < FEW:
         return plain
     typical = median(left)
