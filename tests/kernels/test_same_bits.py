@@ -1,13 +1,18 @@
 """Builds of the C by several compilers for several processors print the same bits of the same fits (tests/c/fits.c)."""
 
+import ctypes
 import os
 import platform
 import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from compilers import STRICT, install_zig, machine_compiler
+
+from wavebatch.kernels.build_kernels import compile_library
+from wavebatch.kernels.library import load
 
 PROGRAM = Path(__file__).resolve().parents[1] / "c" / "fits.c"
 pytestmark = pytest.mark.slow
@@ -105,3 +110,29 @@ def test_windows_gives_the_same_bits(plain, zig, tmp_path):
 def test_no_memory_is_misused_or_left(plain, tmp_path):
     flags = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     assert build_and_run([*machine_compiler(), *STRICT, *flags], tmp_path / "fits") == plain
+
+
+@on_x86
+def test_functions_for_four_doubles_have_the_bits_of_two(tmp_path):
+    """`OFFER` in kernels/c/pulse.h compiles them for AVX2 too; -DONLY_FOUR leaves that out."""
+    compile_library(tmp_path / "four.so", ("-DONLY_FOUR",))
+    four, rng = ctypes.CDLL(str(tmp_path / "four.so")), np.random.default_rng(7)
+    for x in (rng.uniform(-750, 710, 10_003), rng.normal(0, 3, 1001), np.array([np.nan, np.inf, -np.inf, 0.0, 5e-324])):
+        for name, values in (("exponentials", x), ("logarithms", x), ("logarithms", abs(x))):
+            assert _ask(four, name, values).tobytes() == _ask(load(), name, values).tobytes()
+    widths, terms = np.linspace(1.5, 9.0, 200), rng.uniform(0.1, 2.0, (4, 3))
+    found = np.zeros((2, 2, 200))
+    for out, library in zip(found, (four, load()), strict=True):
+        library.measure_lobes(ctypes.c_int64(200), _point(widths), ctypes.c_int64(4), *map(_point, (terms, *out)))
+    assert found[0].tobytes() == found[1].tobytes() and (found > 0).all()
+
+
+def _point(array):
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def _ask(library, name, values):
+    """What a function of the library makes of these values."""
+    out = np.empty_like(values)
+    getattr(library, name)(ctypes.c_int64(len(values)), _point(values), _point(out))
+    return out

@@ -1,16 +1,25 @@
 /* Elementary functions and small systems of equations for Python: NumPy's depend on the processor and on its BLAS. */
 
-EXPORT int64_t exponentials(int64_t n, const double *x, double *out) {
+INLINE int64_t exponentials_any(int64_t n, const double *x, double *out) {
     int64_t i = 0;
     for (; i + LANES <= n; i += LANES) *(wide *)(out + i) = exp_wide(*(const wide *)(x + i));
     for (; i < n; i++) out[i] = exp_double(x[i]);
     return 0;
 }
+OFFER(exponentials, (int64_t n, const double *x, double *out), (n, x, out))
 
-EXPORT int64_t logarithms(int64_t n, const double *x, double *out) {
-    for (int64_t i = 0; i < n; i++) out[i] = log_double(x[i]);
+INLINE int64_t logarithms_any(int64_t n, const double *x, double *out) {
+    int64_t i = 0;
+    for (; i + LANES <= n; i += LANES) {
+        const wide a = *(const wide *)(x + i);
+        const wide_bits normal = (a >= 2.2250738585072014e-308) & (a < INFINITY);
+        if (normal[0] & normal[1] & normal[2] & normal[3]) *(wide *)(out + i) = log_wide(a);
+        else for (int64_t j = i; j < i + LANES; j++) out[j] = log_double(x[j]);
+    }
+    for (; i < n; i++) out[i] = log_double(x[i]);
     return 0;
 }
+OFFER(logarithms, (int64_t n, const double *x, double *out), (n, x, out))
 
 /* Solves a symmetric positive definite system of n unknowns for m right-hand sides, (m, n), in place. */
 EXPORT int64_t solve_equations(int64_t n, int64_t m, double *matrix, double *right) {

@@ -75,3 +75,13 @@ static double log_double(double a) {
     n -= extra;
     return n * 6.93147180369123816490e-01 + (n * 1.90821492927058770002e-10 + 2 * q * sum + 2 * q);
 }
+
+/* The same of four normal numbers above 0; n becomes a double as exp_wide makes whole numbers. */
+INLINE wide log_wide(wide a) {
+    const wide_bits bits = (wide_bits)a, whole = (bits - 0x3fe6a09e667f3bcd) >> 52;
+    const wide m = (wide)(bits - (whole << 52)), n = (wide)((wide_bits)((wide){0} + 6755399441055744.0) + whole) - 6755399441055744.0;
+    const wide q = (m - 1) / (m + 1), s = q * q;
+    wide sum = {0};
+    for (int i = 23; i > 1; i -= 2) sum = (sum + 1.0 / i) * s;
+    return n * 6.93147180369123816490e-01 + (n * 1.90821492927058770002e-10 + 2 * q * sum + 2 * q);
+}

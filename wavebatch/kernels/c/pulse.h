@@ -30,6 +30,7 @@ typedef int32_t octet_bits __attribute__((vector_size(32), aligned(16), may_alia
 #define OF(name) name##_octet
 #define TARGET __attribute__((target("avx2")))
 #include "gaussians.h"
+#define AVX2 TARGET
 
 static int has_eight;                          /* whether the processor has AVX2, and the system keeps its registers */
 
@@ -42,7 +43,13 @@ __attribute__((constructor)) static void look_for_eight(void) {
 #else
 enum { has_eight };
 #define add_gaussians_octet add_gaussians_lanes
+#define AVX2
 #endif
+
+/* Offers a function, NAME_any, compiled for AVX2 too, where one register holds four doubles: the same operations, the same bits. */
+#define OFFER(NAME, PARAMETERS, ARGUMENTS) \
+    AVX2 static int64_t NAME##_avx2 PARAMETERS { return NAME##_any ARGUMENTS; } \
+    EXPORT int64_t NAME PARAMETERS { return has_eight ? NAME##_avx2 ARGUMENTS : NAME##_any ARGUMENTS; }
 
 static void sum_of_gaussians(const Pulse *shape, const Echo *echo, const lanes *x, int64_t vectors, Basis out) {
     enum { TOGETHER = 8 };

@@ -33,7 +33,7 @@ static double draw_stacked(const Stacked *s, const double *p, double *z, double 
 }
 
 /* Normal equations (3 m, 3 m), below the diagonal, and the way downhill (3 m). */
-static void gather_stacked(const Stacked *s, const double *p, const double *z, const double *bell, const double *rest,
+INLINE void gather_stacked(const Stacked *s, const double *p, const double *z, const double *bell, const double *rest,
                            double *row, double *normal, double *downhill) {
     const int64_t size = 3 * s->m;
     memset(normal, 0, size * size * sizeof(double));
@@ -76,7 +76,7 @@ static void step_stacked(const Stacked *s, double damping, const double *normal,
 }
 
 /* Fits in place; at (3 m). */
-EXPORT int64_t fit_stack(const Stacked *s, double *at) {
+INLINE int64_t fit_stack_any(const Stacked *s, double *at) {
     const int64_t size = 3 * s->m, rows = s->m * s->n;
     double *memory = malloc((2 * rows + s->n + 2 * size * size + 4 * size + 1) * sizeof(double));
     if (!memory) return -1;
@@ -103,6 +103,7 @@ EXPORT int64_t fit_stack(const Stacked *s, double *at) {
     free(memory);
     return 0;
 }
+OFFER(fit_stack, (const Stacked *s, double *at), (s, at))
 
 /* The main lobe of pulses is looked for within LOBE widths of the main component, in COARSE steps per width; HALVINGS
    steps then find its peak and edges, to 1e-7 of such a step. */
@@ -123,7 +124,7 @@ INLINE wide draw_lobes(int64_t k, const wide *inverse, const wide *height, const
 
 /* Peak and full width at half maximum of the main lobe, for n widths, a multiple of four, of the main component; k others
    have weight, delay and variance. */
-EXPORT int64_t measure_lobes(int64_t n, const double *width, int64_t k, const double *terms, double *peak, double *half_width) {
+INLINE int64_t measure_lobes_any(int64_t n, const double *width, int64_t k, const double *terms, double *peak, double *half_width) {
     wide *inverse = malloc(2 * (k + 1) * sizeof(wide)), *height = inverse + k + 1, coarse[PLACES];
     if (!inverse) return -1;
     for (int64_t i = 0; i < n; i += LANES) {
@@ -171,3 +172,5 @@ EXPORT int64_t measure_lobes(int64_t n, const double *width, int64_t k, const do
     free(inverse);
     return 0;
 }
+OFFER(measure_lobes, (int64_t n, const double *width, int64_t k, const double *terms, double *peak, double *half_width),
+      (n, width, k, terms, peak, half_width))
