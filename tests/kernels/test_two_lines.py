@@ -24,6 +24,20 @@ def test_two_lines_are_found_in_any_direction_and_three_are_not(rng, degrees):
         assert in_two_lines(*lines(rng, number, turned=np.radians(degrees)), 300).mean() < 0.01
 
 
+@pytest.mark.parametrize("degrees", range(0, 180, 13))
+def test_one_line_is_found_in_any_direction(rng, degrees):
+    assert in_two_lines(*lines(rng, 1, turned=np.radians(degrees)), 300).all()
+
+
+def test_one_scan_line_has_no_plane(rng):
+    """Level ground, seen by one sweep: the plane through its noise stood upright, 70 degrees off with an error of 4."""
+    along, across = np.arange(300) * 0.2, np.full(300, 0.0)
+    points = np.stack([along, across + 2e-3 * rng.standard_normal(300), 0.02 * rng.standard_normal(300)], axis=1)
+    ray = np.tile([0.0, 0.25, -1.0], (300, 1))
+    _, gap = measure_normals(points, ray, Surroundings(points), radius=1.5, min_points=8, max_error=5.0)
+    assert (gap == Gap.FEW_NEIGHBOURS).mean() > 0.9 and not (gap == Gap.KNOWN).any()
+
+
 @pytest.mark.parametrize(("n", "most"), [(8, 0.04), (10, 0.01), (16, 0.001)])
 def test_points_at_random_are_rarely_two_lines(rng, n, most):
     u, v = rng.uniform(-1, 1, (2, 5000 * n))

@@ -184,7 +184,7 @@ class Gap(IntEnum):
     KNOWN = 1
     """It has an angle."""
     FEW_NEIGHBOURS = 2
-    """Fewer than min_points neighbours, or all that are in the plane on two scan lines."""
+    """Fewer than min_points neighbours, or all that are in the plane on one or two scan lines."""
     NO_PLANE = 3
     """The neighbours form no plane that the point lies in."""
     TOO_STEEP = 4
@@ -309,7 +309,7 @@ def measure_normals(
         point itself not in it, or two planes (a ridge) fit so much better that the angle may be off by more than
         max_error. TOO_STEEP: the ray nearly lies in the plane; plants seen by one sweep of the scanner form such a
         plane, which is no surface.
-        FEW_NEIGHBOURS: also where those in the plane lie on two scan lines, through which a plane always goes.
+        FEW_NEIGHBOURS: also where those in the plane lie on one or two scan lines, through which a plane always goes.
     """
     angle, error = np.full((2, len(points)), np.nan, np.float32)
     gap = np.full(len(points), Gap.NO_RAY, np.uint8)

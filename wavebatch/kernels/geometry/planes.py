@@ -217,11 +217,15 @@ LEAST_VARIETY = 0.1
 """Two lines have a variety of 0, three equal ones 0.5, points without any order 0.8. Ten points at random lie below
 this in one case of 300, eight in one of 50."""
 
+LEAST_BREADTH = 0.01
+"""Variance across a set over that along it, below which it is one line: a tenth as broad as long. Three lines within
+1.5 m that are 10 cm apart are as broad. Through one line, noise makes a plane of any slope."""
+
 _POWERS = [(p, q) for order in (1, 2, 3, 4) for p in range(order, -1, -1) for q in [order - p]]
 
 
 def in_two_lines(u: np.ndarray, v: np.ndarray, group: np.ndarray, n: int) -> np.ndarray:
-    """Find the sets whose points lie on two parallel lines.
+    """Find the sets whose points lie on one line, or on two parallel lines.
 
     Parameters
     ----------
@@ -263,7 +267,9 @@ def in_two_lines(u: np.ndarray, v: np.ndarray, group: np.ndarray, n: int) -> np.
         with np.errstate(divide="ignore", invalid="ignore"):
             variety = fourth / second**2 - third**2 / second**3 - 1.0
         least = np.fmin(least, variety)
-    return least < LEAST_VARIETY
+    middle, half = 0.5 * (moments[2, 0] + moments[0, 2]), 0.5 * (moments[2, 0] - moments[0, 2])
+    longer = np.sqrt(half**2 + moments[1, 1] ** 2)
+    return (least < LEAST_VARIETY) | (middle - longer < LEAST_BREADTH * (middle + longer))
 
 
 CUTS = 6

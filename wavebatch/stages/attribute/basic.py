@@ -412,7 +412,7 @@ def incidence_angle_normals(
     `run` computes it in a second pass, when all points of the strip are there; a block alone gives no-data. The plane
     is fitted to all points within the radius that are not outliers. It needs neither sensor nor divergence.
 
-    No-data where there are fewer than min_points, or only two scan lines of them (any two lines are in a plane); where
+    No-data where there are fewer than min_points, or only one or two scan lines of them (always in a plane); where
     the points form no plane (plants: less than 60 % of them in it, thicker than a fifth of its width, or the echo not
     in it) or clearly two (a ridge, a valley or a step close by); where the angle exceeds 80 degrees (one sweep of the
     scanner over plants makes a plane that contains its rays); and where its error exceeds max_error. The error includes
