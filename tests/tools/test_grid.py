@@ -234,3 +234,8 @@ def test_counts_of_two_digitizers_are_named(rng, tmp_path, first, named):
     result = _run(tmp_path / "a.las", tmp_path / "b.las", "--column", "high", "--size", 5, "-o", tmp_path / "x.tif")
     words = f"warning: high: counts of {tmp_path / 'a.las'} (8 bits, 1 ns apart) and {tmp_path / 'b.las'} (12 bits"
     assert (words in result.stderr) == named and ("do not compare" in result.stderr) == named
+    for kind, more in (("histogram", ()), ("map", ("--size", 5)), ("histogram", ("--each",))):
+        picture = run_command("plot", kind, tmp_path / "a.las", tmp_path / "b.las", "--column", "high", *more,
+                              "-o", tmp_path / "x.svg", "--overwrite")  # fmt: skip
+        assert picture.exit_code == 0
+        assert (words in picture.stderr) == (named and more != ("--each",)), kind

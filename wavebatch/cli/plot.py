@@ -15,7 +15,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_columns, complete_flags
-from wavebatch.cli.messages import NearestGroup, answer, tell
+from wavebatch.cli.messages import NearestGroup, answer, talk, tell
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import check_target
@@ -45,6 +45,13 @@ def draws_clouds(
             paths = find(clouds, options)
             check_picture(output, overwrite=options["overwrite"])
             text, found = draw(paths, output, options)
+            from wavebatch.tools.cells import name_recordings
+
+            # Of several lines each is of one cloud; segments and voxels have no counts.
+            columns = [options["column"]] if options.get("column") and not options.get("each") else []
+            mixed = name_recordings(paths, columns) if paths[0].suffix.lower() in (".las", ".laz") else ""
+            if mixed:
+                talk(f"warning: {mixed}")
             tell(f"{output}: {text}")
             answer({"output": str(output), "clouds": [str(path) for path in paths], **found})
 
