@@ -188,7 +188,7 @@ def test_a_reference_that_no_surface_shows_is_no_reference():
 def test_survey_says_what_angles_the_beam_tells(village):
     strip = village[0] / "v1.las"
     wide = call("survey", strip, "--divergence", "1.1", "-o", village[0] / "s.toml").stdout
-    assert "needed    incidence angle" in wide and "a beam of 1.1 mrad on a slope of 30 degrees" in wide
+    assert "yes      incidence angle" in wide and "a beam of 1.1 mrad on a slope of 30 degrees" in wide
     assert "divergence_mrad = 1.1" in (village[0] / "s.toml").read_text()
     narrow = call("survey", strip, "--divergence", "0.05").stdout
-    assert "left out  incidence angle" in narrow
+    assert "no       incidence angle" in narrow
