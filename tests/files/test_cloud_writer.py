@@ -132,6 +132,7 @@ GEOTIFF, WKT_RECORD = Vlr(b"LASF_Projection", 34735, bytes(8)), Vlr(b"LASF_Proje
         ("1.4", 4, [OTHER_KEYS], ((1, 4), 1, 0)),
         ("1.3", 4, [OTHER_KEYS], ((1, 3), 1, 0)),
         ("keep", 4, [OTHER_KEYS], ((1, 3), 1, 0)),
+        ("keep", 4, [OTHER_KEYS, "bit"], ((1, 3), 1, 0)),
         ("1.4", 9, [GEOTIFF], ((1, 4), 6, 0)),
         ("1.4", 9, [GEOTIFF, WKT_RECORD], ((1, 4), 6, 16)),
         ("1.4", 9, [GEOTIFF, "extended"], ((1, 4), 6, 16)),
@@ -140,8 +141,11 @@ GEOTIFF, WKT_RECORD = Vlr(b"LASF_Projection", 34735, bytes(8)), Vlr(b"LASF_Proje
 def test_version_format_and_legacy_fields_agree(tmp_path, las_version, made, vlrs, expected):
     """Legacy counts are zero in point formats 6 to 10 (PDAL, copclib), and the WKT bit says which CRS record counts."""
     evlrs = [(b"LASF_Projection", 2112, b"PROJCRS\0")] * ("extended" in vlrs)
-    vlrs = [vlr for vlr in vlrs if vlr != "extended"]
-    points = write_source(tmp_path / "a.las", made, (1, 3) if made == 4 else (1, 4), vlrs=vlrs, evlrs=evlrs)
+    bit = 16 * ("bit" in vlrs)
+    vlrs = [vlr for vlr in vlrs if vlr not in ("extended", "bit")]
+    points = write_source(
+        tmp_path / "a.las", made, (1, 3) if made == 4 else (1, 4), vlrs=vlrs, evlrs=evlrs, global_encoding=bit
+    )
     layout, _ = copy(tmp_path / "a.las", tmp_path / "b.laz", points, COLUMNS, las_version=las_version)
     header = read_header(tmp_path / "b.laz")
     assert (header.version, header.point_format, header.global_encoding & 16) == expected
@@ -461,12 +465,14 @@ def test_more_points_than_an_old_header_counts(tmp_path):
 
 def test_records_whose_ids_are_no_text_do_not_keep_laspy_from_opening_the_cloud(tmp_path):
     path = tmp_path / "a.las"
-    points = write_source(path, 9, (1, 4))
+    points = write_source(path, 9, (1, 4), evlrs=[(b"caf\xe9", 9, b"z")])
     layout = plan_output(path, [])
     layout.source.header.vlrs.append(Vlr(b"caf\xe9", 7, b"x", b"\xff\xfe text"))
     layout.source.header.vlrs.append(Vlr("é".encode(), 8, b"y", b"fine\0\xff"))
     cloud = write(layout, tmp_path / "b.las", layout.rows(points))
-    found = {vlr.record_id: vlr for vlr in read_header(tmp_path / "b.las").vlrs}
+    header = read_header(tmp_path / "b.las")
+    found = {vlr.record_id: vlr for vlr in header.vlrs}
+    assert [evlr.user for evlr in find_evlrs(tmp_path / "b.las", header)[0]] == ["caf?"]
     assert found[7].user_id.rstrip(b"\0") == b"caf?" and found[7].description.rstrip(b"\0") == b"?? text"
     assert found[8].user_id.rstrip(b"\0") == "é".encode() and found[8].payload == b"y"
     assert list(cloud.dropped) == ["VLR caf? 7"]

@@ -93,6 +93,21 @@ def test_measured_widths_come_first(cloud, tmp_path):
     assert np.percentile(above, 10) >= 7
 
 
+@pytest.mark.parametrize(("given", "expected"), [(1, 4), (3, 5), (6, 9), (7, 10)])
+def test_points_are_those_of_the_cloud_and_pieces_cut_no_pulse(cloud, given, expected, tmp_path):
+    las = laspy.convert(laspy.read(cloud), point_format_id=given)
+    las.user_data[:] = np.arange(len(las)) % 251
+    las.write(tmp_path / "c.las")
+    summary = synthesize_strip(tmp_path / "c.las", tmp_path / "s.laz", SynthesisOptions(gain=0.1), piece=37)
+    assert summary.packets == 2000 and summary.scattered == 0 and check_file(tmp_path / "s.laz").is_clean
+    with laspy.open(tmp_path / "s.laz", read_evlrs=False) as reader:
+        assert reader.header.point_format.id == expected
+    before, after = read_cloud(tmp_path / "c.las")[0], read_cloud(tmp_path / "s.laz")[0]
+    assert len(np.unique(after["wavepacket_offset"])) == 2000
+    for field in before.dtype.names:
+        assert np.array_equal(before[field], after[field]), field
+
+
 def test_reflectances_are_weakened_with_range(tmp_path):
     simulate_returns("flat", tmp_path / "c.las", pulses=300)
     radar = {height: Radar(height, power=4000.0) for height in (620.0, 1120.0)}
@@ -103,6 +118,11 @@ def test_reflectances_are_weakened_with_range(tmp_path):
         (block,) = read_blocks(tmp_path / f"{height}.las")
         peaks.append(block.samples.max(axis=1) - 12.0)
     assert np.median(peaks[0] / peaks[1]) == pytest.approx(4 * 10 ** (2 * 0.5 * 0.22 / 10), rel=0.02)
+    points = read_cloud(tmp_path / "c.las")[0]
+    distance = 500.0 / np.cos(np.radians(points["scan_angle_rank"].astype(float)))
+    # Of a surface that fills the footprint, without the beam's divergence.
+    power = 4000.0 * 0.1**2 * points["intensity"] / 65535 * 0.5 * 10 ** (-0.22e-4 * 2 * distance) / (4 * distance**2)
+    assert np.median(peaks[0] / (1e11 * power)) == pytest.approx(0.99, abs=0.01)  # samples are beside the peak
     with pytest.raises(InputError, match="above the sensor"):
         synthesize_strip(tmp_path / "c.las", tmp_path / "x.las", SynthesisOptions("reflectance", 1.0, Radar(100.0)))
 

@@ -64,6 +64,14 @@ def test_samples_hold_the_truth(name):
     assert residual.std() == pytest.approx(np.hypot(recording.recorded_noise, recording.baseline_spread), rel=0.02)
 
 
+def test_the_after_pulse_of_riegl():
+    pulse = find_pulse("riegl")
+    recording = Recording(n_samples=100, spacing=0.5, pulse=pulse)
+    one = np.array([0]), np.array([10.0]), np.array([100.0])
+    signal = render.paint_echoes(recording, 1, *one, np.array([pulse.sigma]))[0]
+    assert 3.0 < signal[41] < 5.0
+
+
 def test_hazards_are_what_they_say():
     constant, truth = make_block("stiff.constant", 3000)
     assert len(truth) == 0
@@ -197,6 +205,13 @@ def test_flags_of_the_truth():
         assert bool(flags[row] & EchoFlag.OVERLAPPED) == bool(close.any())
         assert bool(flags[row] & EchoFlag.SATURATED) == (truth.amplitude[row] + 12 > 255)
         assert bool(flags[row] & EchoFlag.WEAK) == (truth.amplitude[row] < 5 * scene.recording.recorded_noise)
+
+
+def test_noise_has_the_spread_and_the_colour_asked_for():
+    recording = Recording(noise_std=8.0, rho=0.667, baseline=100.0, baseline_spread=0.0)
+    counts = render.record_counts(recording, np.zeros((4000, 80), np.float32), np.random.default_rng(2)) - 100.0
+    assert counts.std() == pytest.approx(recording.recorded_noise, rel=0.01)
+    assert (counts[:, 1:] * counts[:, :-1]).mean() / counts.var() == pytest.approx(0.667, abs=0.01)
 
 
 def test_signal_adds_variance_when_asked():
