@@ -188,10 +188,12 @@ def assemble_echoes(
     table = echoes.table.with_flags(EchoFlag.ADDED, point < 0)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
+    # Passed through: points without a usable packet, and points of owned packets that no echo matches.
     missing = np.flatnonzero(unit.point_flags)
     silent = np.flatnonzero(owned[members.packet] & ~found)
     passed = np.concatenate([missing, silent])
     no_echo = np.full(len(silent), EchoFlag.NO_ECHO, np.uint16)
+    # Rows are sorted by the first point of their packet, or by their point where they have no packet.
     owner = np.append(unit.packets.owner - unit.start, -1)
     owner = owner[np.concatenate([table.waveform, members.packet[passed]])]
     source = np.concatenate([members.find(echoes.nearest), passed])
@@ -317,7 +319,7 @@ def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarra
     packet[unit.packets.owner[rows] - unit.start] = rows
     lead = np.flatnonzero((packet >= 0) | (unit.point_flags > 0))
     number = np.bincount(pulse[lead], minlength=len(time))
-    # Of each group the packet whose ray points without one may be on; they need none in groups without any.
+    # Points without a packet have no ray: they belong to the pulse if they lie on the ray of a packet of their group.
     known = np.full(len(time), -1)
     owners = lead[packet[lead] >= 0][::-1]
     known[pulse[owners]] = packet[owners]

@@ -141,7 +141,7 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
     found |= {f"return_{k}": part.by_number.get(k, 0.0) for k in range(1, 1 + most_number)}
     found |= {f"pulses_with_{k}": part.by_count.get(k, 0.0) for k in range(1, 1 + most_count)}
     ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in returns.AREA_RANKS)]
-    # A cloud has more classes above the third than AREA_RANKS, which are joined here.
+    # AREA_RANKS ends with all pairs above the third return; a cloud counts each of them, so they are added up here.
     unknown = returns.Separation(0, math.nan, math.nan)
     apart = {pair: part.separations.get(pair, unknown) for pair in returns.AREA_RANKS[:-1]}
     rest = [one for name, one in part.separations.items() if name not in (*apart, "all") and one.pairs]

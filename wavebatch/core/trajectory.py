@@ -44,7 +44,9 @@ class Trajectory:
     def build(
         cls, time: np.ndarray, xyz: np.ndarray, velocity: np.ndarray | None = None, gap: float | None = None
     ) -> Trajectory:
-        """A trajectory from positions in any order; rows with NaN, beyond FARTHEST and LATEST, and of equal times go.
+        """A trajectory from positions in any order.
+
+        Rows with NaN, rows beyond FARTHEST and LATEST, and rows less than LEAST_STEP after another are left out.
 
         Parameters
         ----------
