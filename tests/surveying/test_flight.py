@@ -79,6 +79,18 @@ def test_a_strip_of_another_sensor_does_not_belong_to_them(strips, flight, name,
         assert words in hold_strip(reader, scan, kept)
 
 
+def test_a_stranger_does_not_give_a_descriptor_its_meaning(strips):
+    """Each sensor had most waveforms of one of two descriptors: no strip fitted both, and nothing was surveyed."""
+    samples = []
+    for name, numbers in ("flat", (600, 60)), ("other", (100, 200)):
+        parts = [read_samples([strips[name]], waveforms=number)[0] for number in numbers]
+        blocks = [replace(part.blocks[0], digitizer=replace(part.blocks[0].digitizer, index=index))
+                  for index, part in enumerate(parts, 1)]  # fmt: skip
+        samples.append(replace(parts[0], blocks=tuple(blocks)))
+    found = survey_flight(samples)
+    assert [strip.path for strip in found.misfits] == [strips["other"]] and found.saved.survey.waveforms == 660
+
+
 @pytest.mark.parametrize("name", [*FLIGHT, "calm"])
 def test_a_later_strip_of_the_sensor_belongs_to_them(strips, flight, name):
     kept = replace(parse_survey(format_survey(flight.saved), "x"), fingerprint={})

@@ -142,8 +142,8 @@ def find_strips(
     for path in strips:
         other = stems.setdefault(os.path.normcase(path.stem), path)
         if other is not path:
-            raise ConfigError(f"{other} and {path}: both outputs would be named {path.stem}; use two output folders, and "
-                              "one for clouds that holds no strips")  # fmt: skip
+            raise ConfigError(f"{other} and {path}: both outputs would be named {path.stem}; use two output folders, "
+                              "and one for clouds, without strips")  # fmt: skip
     return strips
 
 

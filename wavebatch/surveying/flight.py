@@ -187,18 +187,23 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     waveforms are surveyed together, and all strips are compared with the result. Those that fit are surveyed again,
     until the group stays.
     """
-    # What each descriptor index means in most strips; of two meanings with as many, that of more waveforms.
-    votes: dict[int, dict[Kind, list[int]]] = {}
+    # What each descriptor index means, by strips that have it so, then by waveforms. Strips that contradict what is
+    # decided have no vote in the rest: strangers would give one index their meaning, and no strip would fit all.
+    votes: dict[tuple[int, Kind], list[int]] = {}
     for sample in samples:
         counts: Counter[tuple[int, Kind]] = Counter()
         for block in sample.blocks:
             counts[block.digitizer.index, kind_of(block)] += len(block)
-        for (index, kind), number in counts.items():
-            votes.setdefault(index, {}).setdefault(kind, []).append(number)
-    kinds = {
-        index: max((len(numbers), sum(numbers), kind) for kind, numbers in meant.items())[2]
-        for index, meant in sorted(votes.items())
-    }
+        for meaning, number in counts.items():
+            votes.setdefault(meaning, []).append(number)
+    order = sorted(votes, key=lambda meaning: (len(votes[meaning]), sum(votes[meaning]), meaning), reverse=True)
+    kinds: dict[int, Kind] = {}
+    voters = [{block.digitizer.index: kind_of(block) for block in sample.blocks} for sample in samples]
+    for index, kind in order:
+        if index not in kinds and any(meant.get(index) == kind for meant in voters):
+            kinds[index] = kind
+            voters = [meant for meant in voters if meant.get(index, kind) == kind]
+    kinds = dict(sorted(kinds.items()))
     group, seen = _find_group([sample for sample in samples if not _compare_kinds(sample.blocks, kinds)], spread)
     for _ in range(ROUNDS):
         blocks = [block for sample in group for block in sample.blocks]
