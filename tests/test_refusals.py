@@ -109,7 +109,7 @@ RUNS = [
     (f"{RUN} --points echos", 2, "--points"),
     (f"{RUN} --nothing", 2, "--nothing"),
     (f"{RUN} none*.las", 2, "matches no .las or .laz file"),
-    ("run strip.las twin/strip.las -o out", 2, "both outputs would be named strip; .. one for clouds, without strips\n"),
+    ("run strip.las twin/strip.las -o out", 2, "both outputs would be named strip; .. for clouds, without strips\n"),
     ("run strip.las -o strip.las", 2, "'strip.las' is a file, not a folder"),
     ("run bad.las -o out --survey flight", 4, "bad.las"),
     (f"{RUN} --tolerance 2", 2, "'2' is no length"),

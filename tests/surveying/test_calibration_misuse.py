@@ -935,7 +935,7 @@ def test_a_channel_recorded_otherwise_in_either_direction_has_no_constant(name, 
     row = ChannelConstant(1, 0, 1.0, 0.02, bits=8, spacing_ns=1.0, gain=1.0)
     digitizer = Digitizer(index=1, bits=8, n_samples=80, spacing=1.0, gain=1.0, offset=0.0)
     assert not strip_match._contradict(row, digitizer, 4.0)
-    assert "digitizer 1 has" in strip_match._contradict(replace(row, **{name: value}), digitizer, 4.0)
+    assert f"has a {name.split('_')[0]} of" in strip_match._contradict(replace(row, **{name: value}), digitizer, 4.0)
 
 
 def test_a_strip_takes_its_own_constant_and_not_that_of_another_one():
