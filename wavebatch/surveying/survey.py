@@ -258,7 +258,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
-        noise = lower_noise(part, replace(borne, noise=system.noise))
+        noise, looked = lower_noise(part, replace(borne, noise=system.noise))
         if noise is not system.noise:
             lowered = system.noise.std
             system, borne = replace(system, noise=noise), replace(borne, noise=noise)
@@ -269,7 +269,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if not (system.components or system.kappa):  # a plain Gaussian: what it leaves after each echo
             tail = (share for lag, share in system.tail_misfit if 0 < lag <= RINGING_REACH * system.sigma_ref)
             system = replace(system, ringing=max((share for share in tail if share >= LEAST_RINGING), default=0.0))
-        system = choose_whitening(part, system, choice.best.change)
+        system = choose_whitening(part, system, choice.best.change, looked)
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
         system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)

@@ -50,7 +50,7 @@ static double lay_out(const Described *w, int64_t i, Desk *d) {
     for (int64_t t = 0; t < d->vectors * LANES; t++) {
         int counts = t < w->length && w->used[begin + t];
         if (counts && w->gain > 0) {
-            double variance = w->variance + w->gain * fmax(w->model[begin + t], 0);
+            double variance = w->variance + w->gain * at_least(w->model[begin + t], 0);
             inverse = 1 / sqrt(variance);
             size = 0.5 * log_double(variance * w->left_over);
         }
@@ -356,7 +356,7 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
         for (int64_t t = 0; t < vectors * LANES; t++) {
             int counts = t < w->length && w->used[begin + t];
             double model = counts ? w->model[begin + t] : 0, rest = counts ? w->left[begin + t] : 0;
-            double spread = w->variance + w->gain * fmax(model, 0) + w->change * w->change * model * model;
+            double spread = w->variance + w->gain * at_least(model, 0) + w->change * w->change * model * model;
             weight[t] = counts ? sqrt((FREEDOM + 1) / (FREEDOM + rest * rest / spread) / spread) : 0;
             y[t] = counts ? rest + model : 0;
         }
@@ -368,8 +368,8 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
                 double sigma = sqrt(fmax(variance[c] + more, NARROWEST * variance[c]));
                 double place = w->time[j] + delay[c];
                 float whole = rint(place), part = place - rint(place), inverse = 1 / sigma, height = w->amplitude[j] * wide / sigma;
-                int64_t from = fmin(fmax(place - REACH * sigma, 0), w->length) / LANES;
-                int64_t to = VECTORS((int64_t)fmin(fmax(place + REACH * sigma + 1, 0), w->length));
+                int64_t from = at_most(at_least(place - REACH * sigma, 0), w->length) / LANES;
+                int64_t to = VECTORS((int64_t)at_most(at_least(place + REACH * sigma + 1, 0), w->length));
                 for (int64_t v = from; v < to; v++) {
                     lanes z = distance(d.x[v], whole, part, inverse);
                     row[v] += exp_lanes(z * z * -0.5f) * height;
@@ -402,8 +402,8 @@ EXPORT int64_t render_pulses(const Described *w, float *out) {
         for (int64_t j = w->first[i]; j < w->first[i + 1]; j++) {
             double before, after;
             find_reach(&w->pulse, w->width[j], &before, &after);
-            const int64_t from = fmin(fmax(w->time[j] - before, 0), w->length) / LANES;
-            const int64_t count = VECTORS((int64_t)fmin(fmax(w->time[j] + after + 1, 0), w->length)) - from;
+            const int64_t from = at_most(at_least(w->time[j] - before, 0), w->length) / LANES;
+            const int64_t count = VECTORS((int64_t)at_most(at_least(w->time[j] + after + 1, 0), w->length)) - from;
             if (count > 0) draw_echo(w, j, d.x + from, count, d.rows);
             for (int64_t v = 0; v < count; v++) d.rest[from + v] += d.rows[v] * (float)w->amplitude[j];
         }

@@ -264,15 +264,15 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         np.maximum.at(highest, owner[here], share[here])
         np.maximum.at(beside, owner[near], share[near])
         whole = (low < place - 2) & (high > place + 2)
-        likely = []
+        likely, level = [], log(np.maximum(highest, 1e-9))
         for middle in distinct(np.round(log(share[here[must[here]]]), 1)):
             part = float(exp(middle))
             seen = whole & (least < LESS * part)
-            alike = seen & (np.abs(log(np.maximum(highest, 1e-9)) - middle) < SAME_SHARE)
+            alike = seen & (np.abs(level - middle) < SAME_SHARE)
             without = np.count_nonzero(seen & (highest < LESS * part) & (beside < part / LESS))
             # Higher echoes there are neighbours, and others of them are as high as the part: as many as in equal steps
             # of the logarithm, or as in the next one.
-            above = log(highest[seen & (highest > part / LESS)]) - middle
+            above = level[seen & (highest > part / LESS)] - middle
             chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
             with_it = np.count_nonzero(alike)
             least_number = max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1))

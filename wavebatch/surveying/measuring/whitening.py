@@ -42,6 +42,8 @@ MOST_LEFT = 1.3
 """chi2 per sample of these fits up to which it does: beyond, the pulse misses its echoes by more than the noise, and a
 filter for noise makes more of that."""
 
+Seen = tuple[SystemPulse, Explained]
+
 LOWER = 0.9
 """Step by which less noise is tried: that of a significance in `settle`, over its first."""
 
@@ -49,7 +51,7 @@ LESS = 0.97
 """Noise over another one up to which it is less: it moves one echo in a hundred."""
 
 
-def lower_noise(block: WaveformBlock, system: SystemPulse) -> ReceiverNoise:
+def lower_noise(block: WaveformBlock, system: SystemPulse) -> tuple[ReceiverNoise, Seen | None]:
     """Take off the noise what echoes too weak to be found add to it, as long as two judges agree.
 
     Parameters
@@ -61,8 +63,10 @@ def lower_noise(block: WaveformBlock, system: SystemPulse) -> ReceiverNoise:
 
     Returns
     -------
-    ReceiverNoise
+    noise : ReceiverNoise
         With less noise of a pulse, never less than that of a sample; or that of the system.
+    seen : (SystemPulse, Explained) or None
+        The system with it, and what it explains of the sample, where that was looked at.
 
     Notes
     -----
@@ -85,7 +89,7 @@ def lower_noise(block: WaveformBlock, system: SystemPulse) -> ReceiverNoise:
                     system, explained = lower, found
                     break
         else:
-            return system.noise
+            return system.noise, (system, explained) if explained else None
 
 
 def _list_lower(system: SystemPulse, spacing: float) -> Iterator[ReceiverNoise]:
@@ -104,7 +108,9 @@ def _list_lower(system: SystemPulse, spacing: float) -> Iterator[ReceiverNoise]:
             yield replace(one, std=max(least, one.std))
 
 
-def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 0.0) -> SystemPulse:
+def choose_whitening(
+    block: WaveformBlock, system: SystemPulse, change: float = 0.0, seen: Seen | None = None
+) -> SystemPulse:
     """Let fits whiten coloured noise where lone echoes then leave white noise, and the judge does not object.
 
     Parameters
@@ -115,6 +121,8 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
         Its pulse and noise.
     change : float
         Of the pulse from shot to shot, as a share of its amplitude.
+    seen : (SystemPulse, Explained), optional
+        As `lower_noise` returns it: a pulse that does not change is explained once.
 
     Returns
     -------
@@ -131,7 +139,7 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
         return plain
     block = thin_samples(block, LOOK)
     whitened = replace(system, noise=replace(system.noise, whitening=whitening))
-    explained = explain(block, plain)
+    explained = seen[1] if seen and seen[0] == plain else explain(block, plain)
     echoes = explained.echoes
     lone = echoes.waveform[find_single(echoes, len(block), system, STRONG)]
     left = find_echoes(block.rows(lone), whitened, max_echoes=1)[2].residual.astype(np.float64) ** 2
