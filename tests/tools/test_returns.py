@@ -99,6 +99,8 @@ def test_flags_are_counted_and_points_without_echo_are_no_pair(tmp_path):
     flags = [0, EchoFlag.NO_ECHO, 0, EchoFlag.WEAK | EchoFlag.OVERLAPPED, EchoFlag.OVERLAPPED, 0, 0]
     found = count_returns([write_cloud(tmp_path / "c.las", **SMALL, flags=flags)])[1]
     assert {name: n for name, n in found.flags.items() if n} == {"NO_ECHO": 1, "WEAK": 1, "OVERLAPPED": 2}
+    more = write_cloud(tmp_path / "d.las", **SMALL, flags=[EchoFlag.WEAK] * 7)
+    assert count_returns([tmp_path / "c.las", more])[1].flags["WEAK"] == 8
     assert found.separations["all"].pairs == 1
 
 
