@@ -76,6 +76,10 @@ HEIGHT_ERROR = 0.05
 """Error of the range, relative, where only the height of the flight is known; and scatter of the points' heights, over
 it, from which one height for all is doubted."""
 
+LARGEST_MISS, MOST_MISS = 0.01, 0.1
+"""Distance by which a ray misses the path, over its length, and share of such rays, from which they do not meet: the
+path of two sensors with the same times is half way between them. Those of real sensors miss it by a thousandth."""
+
 TURNED = ("turned_deg", "turned_error_deg", "is_turned")
 """Facts of a turn of the packet vectors."""
 
@@ -171,7 +175,8 @@ class SensorSource:
         if spread := facts.get("do_not_meet_deg"):
             return (
                 f"range: the packets' vectors spread by {spread:.0f} degrees, but do not meet in a path of the sensor: "
-                "points and vectors are of two CRSs, axes are swapped, or times are wrong; new echoes lie along them"
+                "points and vectors are of two CRSs, axes are swapped, times are wrong or the same for two sensors; "
+                "new echoes lie along them"
             )
         if self.height and facts.get("relief_m", 0.0) > HEIGHT_ERROR * self.height:
             return (
@@ -593,6 +598,11 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
         motion = 0.5 * np.mean(apart)  # both windows are off
     else:
         motion = (JERK * JERK_LEFT * max(fit.half for fit, _, _ in found) ** 3) ** 2
+    sure = rays.weight >= median(rays.weight)
+    unit = rays.direction[sure] / np.sqrt((rays.direction[sure] ** 2).sum(axis=1))[:, None]
+    miss = np.sqrt(np.square(np.cross(rays.point[sure] - path.at(rays.time[sure]), unit)).sum(axis=1))
+    if np.mean(miss > LARGEST_MISS * distance) > MOST_MISS:
+        return None
     error, facts = float(np.sqrt(np.mean(squares) + motion)), _describe(found, path, rays)
     source = SensorSource(kind, path, distance=distance, error=error, facts=facts)
     if pairs is None:
