@@ -99,8 +99,13 @@ def read_scan_lines(
     """The scan lines of a strip in file order.
 
     Lines of fewer than `least` pulses are left out, lines of more than `most` are cut. Memory is bounded.
-    Raises InputError if most pulses are in lines that are too short: the file is not in the order of time.
+    Raises InputError if most pulses are in lines that are too short: the file is not in the order of time; or if the
+    coordinates have no height, or one in another unit.
     """
+    for crs in reader.facts.units:
+        if crs.kind in ("geocentric", "geographic"):
+            what = f"coordinates are {crs.describe()}; slices need heights: project the strip"
+            raise InputError(f"{reader.facts.path}: {what}")
     number = lost = total = 0
     axis = None
     rest: list[_Pulses] = []
