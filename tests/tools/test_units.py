@@ -146,6 +146,7 @@ def test_geocentric_coordinates_have_no_height(clouds, tmp_path):
     found = measure_profile([cloud], "z", "count")
     assert found.upright == "z" and found.label.endswith(" m of z")
     assert "coordinates       geocentric (ECEF)" in _print("info", cloud).stdout
+    assert "first to last is along Z, which is no height" in _print("stats", cloud).stdout
     simulate_strip("flat", tmp_path / "strip.las", pulses=200)
     add_record(tmp_path / "strip.las", build_wkt(GEOCENTRIC))
     said = _print("slice", tmp_path / "strip.las", "-o", tmp_path / "s.csv", code=1).stderr

@@ -422,6 +422,8 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter,
             tally.notes.append(f"coordinates are {reader.unit}: returns have no distances; project the cloud to metres")
         elif reader.metres != (1.0, 1.0, 1.0):
             tally.notes.append(f"coordinates are {reader.unit}: distances and depths are converted to metres")
+        elif not reader.has_heights:
+            tally.notes.append(f"coordinates are {reader.unit}: first to last is along Z, which is no height")
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
         number = count_buckets(reader.point_count, held)

@@ -119,6 +119,7 @@ class CloudReader(Closing):
         self.metres = metres_per_unit(units)
         """Metres of a step of 1 in x, y and z; NaN in degrees."""
         self.unit = name_units(units)
+        self.has_heights = all(unit.kind != "geocentric" for unit in units)
         self.bounds = checked.header.mins, checked.header.maxs
         self.point_format: int = checked.header.point_format
         fields = las.field_names(las.STANDARD_DTYPES[self.point_format])
