@@ -109,8 +109,9 @@ def fit(y, x, std, start, low, high, clipped=None, weight=None, prior=None, whit
         r = (r if white is None else white @ r) / std
         if prior is None:
             return r
-        width, spread = prior
-        return np.concatenate([r, np.maximum(width - parameters[2], 0) / spread])
+        width, spread, both = prior
+        lack = width - parameters[2]
+        return np.concatenate([r, np.where((lack > 0) | both, lack, 0) / spread])
 
     low, high = (np.broadcast_to(edge, start.shape).ravel() for edge in (low, high))
     inner = np.clip(start.ravel(), low + 1e-9, high - 1e-9)

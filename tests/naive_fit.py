@@ -126,7 +126,7 @@ def errors_of(p, x, std, prior, used, shape, known=0.0, white=None):
     fisher[np.arange(k), np.arange(k)] += known
     if prior:
         for j in range(k):
-            fisher[2 * k + j, 2 * k + j] += (p[2, j] < prior[0]) / prior[1] ** 2
+            fisher[2 * k + j, 2 * k + j] += (p[2, j] < prior[0] or prior[2]) / prior[1] ** 2
     return np.sqrt(np.diag(np.linalg.pinv(fisher))).reshape(3, k)
 
 
@@ -139,7 +139,7 @@ def is_resolved(p, errors):
 def decompose(y, std, start, s, clip=np.inf, white=None, **shape):
     """Parameters (3, k), errors and chi2 of one window; s: Settings, whose widths, gates and acceptance count."""
     best = find_echoes(y, std, start, s, clip, white, **shape)
-    if s.grow and best[0].shape[1] > 1:
+    if s.thorough and best[0].shape[1] > 1:
         best = join_broad(y, std, best, s, clip, white, **shape)
     return leave_out_unknown(y, std, best, s, clip, white, **shape) if s.known else best
 
@@ -151,7 +151,8 @@ def find_echoes(y, std, start, s, clip, white, **shape):
     if not may_grow(y, s) or first[2] - len(y) < fall:
         return first
     widths = max(s.width_low, s.width_ref / 1.1), min(s.width_high, s.width_ref * 1.1)
-    narrow = grow(y, std, start, s, widths, clip, white, **shape)
+    known = (s.width_ref, 0.02 * s.width_ref, True) if misses_echoes(y, first[2], fall, s) else None
+    narrow = grow(y, std, start, s, widths, clip, white, known, **shape)
     second = grow(y, std, narrow[0], s, (s.width_low, s.width_high), clip, white, **shape)
     better = second[2] + fall * (second[0].shape[1] - first[0].shape[1]) < first[2]
     return second if better else first
@@ -181,7 +182,7 @@ def leave_out_unknown(y, std, fit, s, clip, white, **shape):
     known, before = np.zeros(k), p[1]
 
     def prior_of(k):
-        return (s.width_ref, s.prior_spread) if s.prior_spread and k > 1 else None
+        return (s.width_ref, s.prior_spread, False) if s.prior_spread and k > 1 else None
 
     def find_errors(p, known):
         used = ~((y >= clip) & (y - naive.model(p, x, **shape) <= 0))
@@ -213,16 +214,23 @@ def may_grow(y, s):
     return s.grow and len(y) <= s.max_echoes * 10 * s.width_high
 
 
-def grow(y, std, start, s, widths, clip, white=None, **shape):
-    """The same from one start, with widths within these two."""
+def misses_echoes(y, chi2, fall, s):
+    return s.thorough and chi2 - len(y) > 9 * fall
+
+
+def grow(y, std, start, s, widths, clip, white=None, known=None, **shape):
+    """The same from one start, with widths within these two; known: prior of them."""
     x = np.arange(float(len(y)))
     clipped = y >= clip
     low = np.array([0.0, -3.0, widths[0]])[:, None]
     high = np.array([1e12, len(y) + 2.0, widths[1]])[:, None]
-    best, target = None, np.inf
+    best, target, missed = None, np.inf, False
     for _ in range(20):
-        prior = (s.width_ref, s.prior_spread) if s.prior_spread and start.shape[1] > 1 else None
+        prior = known or ((s.width_ref, s.prior_spread, False) if s.prior_spread and start.shape[1] > 1 else None)
         p, chi2 = naive.fit(y, x, std, start, low, high, clipped=clipped, prior=prior, white=white, **shape)
+        if missed and start.shape[1] == best[0].shape[1] + 1 and not chi2 < target:
+            start = np.c_[best[0], start[:, -1] * [0.25, 1, 1]]
+            p, chi2 = naive.fit(y, x, std, start, low, high, clipped=clipped, prior=prior, white=white, **shape)
         if not chi2 < target:
             return best
         outside = np.maximum(np.maximum(-p[1], p[1] - x[-1]), 0) / p[2]
@@ -241,6 +249,7 @@ def grow(y, std, start, s, widths, clip, white=None, **shape):
             return best
         start, promise = propose(p, x, residual, std, s, shape, white)
         fall = least_fall(p, std, s)
+        missed = misses_echoes(y, chi2, fall, s)
         if not promise > 0.5 * fall:
             return best
         target = chi2 - fall

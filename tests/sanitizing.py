@@ -162,6 +162,7 @@ def draw_settings(rng: np.random.Generator, s: int) -> Settings:
         gate_hermite=one(8.5, 0, 1e9), undamped=bool(rng.random() < 0.15), skew_mean=one(0, 0.1, 5),
         skew_spread=one(0, 0, 0.1, 1e-30, 1e9), known=one(0, 3, 3, 1e9),
         whitening=None if rng.random() < 0.6 else rng.normal(0, one(1, 1, 0, 1e9), (3, 3)),
+        thorough=bool(rng.random() < 0.6),
     )  # fmt: skip
 
 

@@ -159,7 +159,7 @@ def test_the_width_prior_costs_narrow_echoes_only(rng):
     y, start = record(rng, truth), near(rng, truth)
     held, free = fit(y, start, width_ref=2.2, prior_spread=0.15, **TIGHT), fit(y, start, **TIGHT)
     # The prior sets in with a kink of the slope, around which steps alternate.
-    assert_reaches_scipy(y, held, start, prior=(2.2, 0.15), slack=(0.1, 0.3))
+    assert_reaches_scipy(y, held, start, prior=(2.2, 0.15, False), slack=(0.1, 0.3))
     assert (held.cost > free.cost).all()
     wide = fit(y, start, width_ref=0.5, prior_spread=0.15, **TIGHT)
     np.testing.assert_array_equal(wide.parameters, free.parameters)
@@ -168,7 +168,7 @@ def test_the_width_prior_costs_narrow_echoes_only(rng):
 def test_errors_count_what_the_prior_knows_of_widths(rng):
     truth = draw(rng, 12, 2, apart=3.5)
     truth[:, 2] = [1.7, 2.6]
-    y, prior = record(rng, truth), (2.2, 0.15)
+    y, prior = record(rng, truth), (2.2, 0.15, False)
     held = fit(y, near(rng, truth), width_ref=prior[0], prior_spread=prior[1], **TIGHT)
     for p, errors in zip(held.parameters[:, :3], held.errors[:, :3], strict=True):
         expected = naive_fit.errors_of(p, np.arange(float(LENGTH)), 1.0, prior, np.ones(LENGTH), {})

@@ -55,7 +55,7 @@ def test_auto_is_the_default_and_chooses_per_strip(strips, tmp_path):
         assert report["strip"]["survey"]["from"] == "strip" and report["strip"]["survey"]["waveforms"] > 2000
     out = {r["input"]["file"]: {d["part"] for d in r["choice"]["decisions"] if not d["needed"]} for r in (flat, forest)}
     assert "growth of fits" in out["flat.las"] and "growth of fits" not in out["forest.las"]
-    assert "max_echoes = 1\n" in flat["chain"] and "max_echoes = 6\n" in forest["chain"]
+    assert "max_echoes = 1\n" in flat["chain"] and "max_echoes = 8\n" in forest["chain"]
     assert "microseconds_per_waveform" not in flat["timing"]
 
 

@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parent / "written_files"
 """Written by commit 53e1b4c0 from simulated strips (stiff, village, a flight of three), and two with every key."""
 
 READ = json.loads((FOLDER / "read.json").read_text())
-"""What that commit read from them: fields by name, floats to the last bit."""
+"""What that commit read from them: fields by name, floats to the last bit. Of the chain: with defaults of today."""
 
 
 def plain(value):

@@ -59,7 +59,7 @@ class CSettings(ctypes.Structure):
             "width_ref width_low width_high clip floor noise_gain tolerance acceptance misfit prior_spread "
             "gate_residual gate_hermite known skew_mean skew_spread",
         ),
-        *_fields(ctypes.c_int64, "max_iterations max_echoes grow undamped whitened"),
+        *_fields(ctypes.c_int64, "max_iterations max_echoes grow thorough undamped whitened"),
         ("whitening", ctypes.c_double * 9),
     ]
 

@@ -6,6 +6,10 @@ static const double FAINT = 1;                 /* height in the window, in noise
 static const double MOST_SKEW = 0.6;           /* the half after the peak is then twice as wide as the half before it */
 static const double MOST_AMPLITUDE = 1e12;     /* above any count of 32 bits, also of the peak of a clipped echo */
 static const double BREATH = 1.1;              /* widths of the second try, over or under that of the pulse */
+static const double AS_PULSE = 0.02;           /* spread of widths about that of the pulse in a second try after echoes were missed */
+static const double MISSED = 9;                /* falls that one more echo needs: so much is left where echoes were missed. It is
+                                                  three times what noise and the pulse's misfit explain, as an amplitude */
+static const double FAINT_START = 0.25;        /* share of its amplitude with which an echo starts beside others that stay */
 static const double PROVEN = 2;                /* errors of an amplitude whose echo chi2 proves: simulated pairs scatter by
                                                   .35 to .65 of it, however much chi2 rises without the echo */
 static const double STEADY = 0.01;             /* misfit below which no pulse is known: from shot to shot those of real sensors
@@ -77,30 +81,53 @@ static void exchange(Solution *one, Solution *other) {
     *one = *other; *other = kept;
 }
 
+/* Whether a fit leaves so much more than noise and the pulse's misfit explain that it must have missed echoes. */
+static int misses_echoes(const Settings *s, const Work *work, double cost, double fall) {
+    return s->thorough && cost - work->window.used > MISSED * fall;
+}
+
+/* The best fit and a faint new echo where it was proposed: from there chi2 falls. The step of all echoes at once may end
+   far off, where the pulse is narrow beside the samples. */
+static void start_beside(Work *work) {
+    const int64_t k = work->next.k;
+    for (int64_t q = 0; q < 3; q++) {
+        memcpy(work->fit.parameters + q * k, work->best.parameters + q * (k - 1), (k - 1) * sizeof(double));
+        work->fit.parameters[q * k + k - 1] = work->next.parameters[q * k + k - 1] * (q == 0 ? FAINT_START : 1);
+    }
+}
+
 /* Echoes from the starts in work->next, into work->best; 0, or -1 where there is no memory.
 
    A larger fit is kept if it lowers chi2 below the target and its echoes are resolved; else the one before it stands.
    The number of rounds is bounded, because each echo that is left out must have been there or been added. */
-static int grow_window(const Settings *s, const Limits *limits, Work *work) {
-    const Prior width_prior = {s->width_ref, s->prior_spread, 0, 0}, none = {0};
+static int grow_window(const Settings *s, const Limits *limits, const Prior *widths, Work *work) {
+    const Prior none = {0};
     double target = INFINITY;
+    int missed = 0;
     int64_t rounds = 4 * (work->next.k + s->max_echoes);
     work->best.k = 0;
     for (; rounds > 0; rounds--) {
         const int64_t k = work->next.k;
         memcpy(work->fit.parameters, work->next.parameters, 3 * k * sizeof(double));
-        fit_window(k, 3, s, limits, k > 1 ? &width_prior : &none, target, work);
+        const Prior *prior = k > 1 || widths->both ? widths : &none;
+        fit_window(k, 3, s, limits, prior, target, work);
+        if (missed && k == work->best.k + 1 && (work->fit.hopeless || !(work->fit.cost < target))) {
+            start_beside(work);
+            fit_window(k, 3, s, limits, prior, target, work);
+        }
         if (work->fit.hopeless || (target < INFINITY && !(work->fit.cost < target))) return 0;
         if (leave_out_faint(work)) continue;
         describe_fit(s, limits, work, &work->trial);
         if (target < INFINITY && !is_resolved(&work->trial)) return 0;
         exchange(&work->trial, &work->best);
-        if (!work->fit.converged || !may_grow(s, &work->window) || k >= s->max_echoes) return 0;
+        const double fall = least_fall(s, k, work->fit.parameters, work->window.std);
+        missed = misses_echoes(s, work, work->fit.cost, fall);
+        if (!(work->fit.converged || missed) || !may_grow(s, &work->window) || k >= s->max_echoes) return 0;
         if (s->whitened) whitened_moments(s, work, &work->fit);
         else hermite_moments(work, &work->fit);
         if (!(s->whitened ? is_whitened_misfit : is_misfit)(s, work, &work->fit)) return 0;
         if (!reserve(work, k + 1, work->window.vectors)) return -1;
-        double promise = propose_echo(s, work, &work->fit, limits, &work->next), fall = least_fall(s, k, work->fit.parameters, work->window.std);
+        double promise = propose_echo(s, work, &work->fit, limits, &work->next);
         if (!(promise > 0.5 * fall)) return 0;
         target = work->fit.cost - fall;
     }
@@ -124,21 +151,24 @@ static int set_starts(const Clusters *c, int64_t cluster, Work *work) {
 
    An echo too broad that bridges two, with its neighbours shifted to make up for it, is a minimum that no further echo
    leaves. So where more is left than noise and the pulse's misfit explain, there is a second try: it grows with echoes
-   of the pulse's width, which bridge nothing, and then frees their widths. The better one stands. */
+   of the pulse's width, which bridge nothing, and then frees their widths. The better one stands. Where echoes must have
+   been missed, widths are taken as known meanwhile: with pulses as narrow as the samples, three free parameters of each
+   echo leave nothing of a new one between two. */
 static int decompose_window(const Settings *s, const Clusters *clusters, int64_t cluster, Work *work) {
     const Limits limits = limits_of(s, &work->window);
+    const Prior free = {s->width_ref, s->prior_spread, 0, 0, 0}, known = {s->width_ref, AS_PULSE * s->width_ref, 0, 0, 1};
     Limits narrow = limits;
-    if (!set_starts(clusters, cluster, work) || grow_window(s, &limits, work) < 0) return -1;
+    if (!set_starts(clusters, cluster, work) || grow_window(s, &limits, &free, work) < 0) return -1;
     const int64_t k = work->best.k;
     const double cost = work->best.cost, fall = least_fall(s, k, work->best.parameters, work->window.std);
     if (!may_grow(s, &work->window) || cost - work->window.used < fall) return 0;
     exchange(&work->best, &work->spare);
     narrow.low[2] = fmax(limits.low[2], s->width_ref / BREATH);
     narrow.high[2] = fmin(limits.high[2], s->width_ref * BREATH);
-    if (!set_starts(clusters, cluster, work) || grow_window(s, &narrow, work) < 0) return -1;
+    if (!set_starts(clusters, cluster, work) || grow_window(s, &narrow, misses_echoes(s, work, cost, fall) ? &known : &free, work) < 0) return -1;
     work->next.k = work->best.k;
     memcpy(work->next.parameters, work->best.parameters, 3 * work->best.k * sizeof(double));
-    if (grow_window(s, &limits, work) < 0) return -1;
+    if (grow_window(s, &limits, &free, work) < 0) return -1;
     if (!(work->best.cost + fall * (work->best.k - k) < cost)) exchange(&work->best, &work->spare);
     return 0;
 }
@@ -187,7 +217,7 @@ static void renew_errors(const Settings *s, const Prior *prior, Work *work) {
    the time of each other may be wrong by as much as it moves. */
 static void leave_out_unknown(const Settings *s, Work *work) {
     const Limits limits = limits_of(s, &work->window);
-    const Prior prior = {s->width_ref, s->prior_spread, 0, 0}, none = {0};
+    const Prior prior = {s->width_ref, s->prior_spread, 0, 0, 0}, none = {0};
     const double noise = work->window.std;
     Solution *best = &work->best;
     const int64_t all = best->k;
@@ -233,7 +263,7 @@ static void leave_out_unknown(const Settings *s, Work *work) {
 static void free_skews(const Settings *s, Work *work) {
     const int64_t k = work->best.k;
     const Limits limits = limits_of(s, &work->window);
-    const Prior prior = {0, 0, s->skew_mean, s->skew_spread};
+    const Prior prior = {0, 0, s->skew_mean, s->skew_spread, 0};
     memcpy(work->fit.parameters, work->best.parameters, 3 * k * sizeof(double));
     for (int64_t j = 0; j < k; j++) work->fit.parameters[3 * k + j] = s->pulse.kind == SKEWED ? s->pulse.skew : 0;
     fit_window(k, 4, s, &limits, &prior, INFINITY, work);
@@ -279,7 +309,7 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
         if (s->whitened && s->grow) find_new_energy(&work);
         if (decompose_window(s, clusters, i, &work) < 0) { i = -1; break; }
-        if (s->grow && work.best.k > 1) join_broad(s, &work);
+        if (s->thorough && work.best.k > 1) join_broad(s, &work);
         if (s->known > 0) leave_out_unknown(s, &work);
         if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
         if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);

@@ -98,7 +98,7 @@ INLINE double add_prior(int64_t k, int64_t per, const Prior *prior, double std, 
     double cost = 0;
     for (int64_t j = 0; j < k; j++) {
         double height = at_least(p[j], 0.5 * std), lack = prior->width - p[2 * k + j];
-        if (prior->spread > 0 && lack > 0) {
+        if (prior->spread > 0 && (lack > 0 || prior->both)) {
             double unit = p[2 * k + j] / height, weight = std * std / (prior->spread * prior->spread);
             int64_t at = 2 * k + j;
             cost += weight * lack * lack;

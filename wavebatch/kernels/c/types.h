@@ -27,7 +27,7 @@ typedef struct {
     double gate_residual, gate_hermite;        /* of the residual test, 4.2 */
     double known;                              /* errors that an amplitude needs beside other echoes; 0: it is not asked */
     double skew_mean, skew_spread;             /* of free skews; spread 0: skews are not free */
-    int64_t max_iterations, max_echoes, grow, undamped, whitened;
+    int64_t max_iterations, max_echoes, grow, thorough, undamped, whitened;
     double whitening[3][3];                    /* row q: coefficients of a sample, and of those before it, after q others */
 } Settings;
 

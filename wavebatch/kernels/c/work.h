@@ -9,7 +9,7 @@ typedef struct { /* samples of one cluster, padded to whole vectors */
     int any_clipped, is_weighted, is_whitened;
 } Window;
 
-typedef struct { double width, spread, skew, skew_spread; } Prior; /* spread 0: none */
+typedef struct { double width, spread, skew, skew_spread; int both; } Prior; /* spread 0: none; both: of wider echoes too */
 
 typedef struct { /* k echoes with `per` parameters each: k amplitudes, then k times, widths, skews */
     int64_t k, per;

@@ -115,6 +115,8 @@ class Settings(NamedTuple):
     """Largest number of iterations of one fit; 40 at least where samples are clipped."""
     grow: bool = True
     """Whether echoes are added where the residual shows more than noise."""
+    thorough: bool = False
+    """Whether missed echoes are searched again, and one broad echo may stand for several (docs/algorithms.md 2.3)."""
     acceptance: float = 15.0
     """Smallest fall of chi2 for which an echo is added (docs/algorithms.md 2.3)."""
     misfit: float = 0.0

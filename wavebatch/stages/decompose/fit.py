@@ -141,7 +141,8 @@ def gauss_newton(
 def adaptive(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     acceptance: Annotated[float, Range(0.0, 1e6)] = 0.0,
-    max_echoes: Annotated[int, Range(1, 1000)] = 6,
+    max_echoes: Annotated[int, Range(1, 1000)] = 8,
+    thorough: bool = True,
     gate_residual: Annotated[float, Range(0.0, 1e6)] = 4.2,
     gate_hermite: Annotated[float, Range(0.0, 1e6)] = 8.5,
     width_prior: Annotated[float, Range(0.0, 100.0)] = 0.1,
@@ -159,6 +160,9 @@ def adaptive(
         Least fall of chi2 for which an echo is added; 0 takes the value of the survey.
     max_echoes : int
         Most echoes per cluster to which a fit grows.
+    thorough : bool
+        Whether echoes are searched again where a fit leaves so much that it must have missed some, and one echo broader
+        than `most_width` is taken where several explain no more.
     gate_residual : float
         Largest smoothed residual of a complete fit [standard deviations].
     gate_hermite : float
@@ -179,6 +183,7 @@ def adaptive(
         shape,
         fit,
         grow=True,
+        thorough=thorough,
         acceptance=acceptance or system.acceptance,
         misfit=max(fit_misfit(system, block.spacing), SINGLE_PRECISION),
         max_echoes=max_echoes,

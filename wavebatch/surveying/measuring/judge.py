@@ -51,6 +51,9 @@ SURE = 3.0
 KNOWN, LEAST_KNOWN = 0.15, 10
 """Largest error of a width that tells of the density of widths, as a share of it; fewest widths that do."""
 
+SEARCH = {"max_echoes": 6, "thorough": False}
+"""How far fits of a survey look for echoes: one that explains all with ever more of them hides what a pulse misses."""
+
 _DOUBTFUL = np.uint16(EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED | EchoFlag.MERGED)
 
 
@@ -90,7 +93,7 @@ def find_echoes(
     """As `explain`, without what echoes leave: the block as it was decomposed, its noise, echoes with all errors."""
     block = clean_block(block, system)
     noise = pooled_noise(block, system)
-    return block, noise, adaptive(block, noise, system, detect(block, noise, system), **options)
+    return block, noise, adaptive(block, noise, system, detect(block, noise, system), **SEARCH | options)
 
 
 def find_changed(one: Explained, other: Explained) -> np.ndarray:
