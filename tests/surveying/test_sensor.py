@@ -305,10 +305,14 @@ def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
 @pytest.mark.parametrize(("apart", "meets"), [((0, 0, 0), True), ((30, 0, 0), False), ((0, 0, 150), False)])
 def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_path, apart, meets):
     """Two flights of one time of the week: a path half way between them was 14 and 79 m off, with errors of 3 and 4."""
-    first = np.random.default_rng(3).random(8000)[:, None] < 0.5
+    trajectory = facet_strips.write_trajectory(tmp_path / "t.csv", Sensor(), 2.0)
+    first = np.random.default_rng(3).random(8000)[:, None] < 0.4
     monkeypatch.setattr(facet_strips, "path_of", lambda sensor, seconds: path_of(sensor, seconds) + first * apart)
     strip = write_strip(tmp_path / "a.las", [Facet(0.3)], Sensor(rate=5000.0, n_samples=40), 8000)
     assert (find(strip).kind == "direction vectors") == meets
+    if apart[0]:
+        with pytest.raises(InputError, match="or to a part of this one"):
+            find(strip, trajectory=trajectory)
 
 
 def test_a_strip_that_is_sorted_by_place_has_the_sensor_at_all_times(tmp_path, edit_points):

@@ -15,7 +15,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import distinct, median, robust_std
+from wavebatch.core.order import distinct, median, quantile, robust_std
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.units import AIR_ATTENUATION
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -508,7 +508,9 @@ def _turn_by_pairs(pairs: RaySample) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> float:
-    """Median angle between packet vectors and rays from the trajectory [rad]; InputError where it is too large."""
+    """Median angle between packet vectors and rays from the trajectory [rad]; InputError where it is too large, or that
+    of a tenth of the rays, which are of another flight then.
+    """
     with np.errstate(all="ignore"):
         ahead = ahead / distance[:, None]
         unit = rays.direction / np.sqrt((rays.direction**2).sum(axis=1))[:, None]
@@ -516,11 +518,12 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
     cosine = cosine[np.isfinite(cosine)]
     if not len(cosine):
         return 0.0
-    angle = float(median(np.arccos(cosine)))
-    if angle > LARGEST_ANGLE:
+    angle, most = (quantile(np.arccos(cosine), share) for share in (0.5, 1.0 - MOST_MISS))
+    if most > LARGEST_ANGLE:
         raise InputError(
-            f"the trajectory's rays are {np.degrees(angle):.1f} degrees off the packets' vectors: it belongs to "
-            "another strip, has another CRS, or its clock is off by seconds (UTC is 18 s less than GPS time)"
+            f"the trajectory's rays are {np.degrees(most):.1f} degrees off the packets' vectors: it belongs to another "
+            "strip, or to a part of this one, has another CRS, or its clock is off by seconds (UTC is 18 s less than "
+            "GPS time)"
         )
     return angle
 
