@@ -16,6 +16,17 @@ def flight(rate=20.0, seconds=20.0, start=300_000_000.0):
     return time, xyz
 
 
+@pytest.mark.parametrize(("rate", "limit"), [(200.0, 1e-5), (1.0, 0.01)])
+def test_interpolation_whatever_the_order_of_the_positions(rate, limit):
+    time, xyz = flight(rate)
+    mixed = np.random.default_rng(1).permutation(np.r_[np.arange(len(time)), 5, 6])
+    path = Trajectory.build(time[mixed], xyz[mixed])
+    asked, places = flight(997.0, 18.0)
+    inside = (asked > path.time[2]) & (asked < path.time[-3])
+    assert np.abs(path.at(asked[inside]) - places[inside]).max() < limit
+    assert path.at(path.time) == pytest.approx(xyz, abs=1e-9)
+
+
 def test_nothing_is_said_outside_and_in_gaps():
     time, xyz = flight()
     keep = (time < 300_000_005.0) | (time > 300_000_009.0)
