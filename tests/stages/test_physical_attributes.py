@@ -222,6 +222,35 @@ def test_echoes_that_are_far_too_narrow_are_flagged():
     assert done.attributes["incidence_angle"].tolist() == [0.0, 0.0, 0.0]
 
 
+def test_reasons_of_single_echoes():
+    block, echoes, _ = make(np.full(12, 30.0), snr=300.0)
+    marks = (EchoFlag.SATURATED | EchoFlag.AMPLITUDE_UNRELIABLE, EchoFlag.NEAR_EDGE, EchoFlag.NOT_CONVERGED,
+             EchoFlag.AT_BOUND, EchoFlag.MERGED)  # fmt: skip
+    for row, flag in enumerate(marks):
+        echoes = echoes.with_flags(flag, np.arange(12) == row)
+    echoes = replace(echoes, sigma=np.where(np.arange(12) == 5, np.float32(40.0), echoes.sigma))
+    told = reasons(run(block, echoes, SYSTEM, "incidence_angle", "cross_section", "level_reflectance"))
+    angles = {"KNOWN": 6, "OVERLAPPED": 1, "SATURATED": 1, "CUT": 1, "UNSETTLED": 2, "TOO_STEEP": 1}
+    assert told["incidence_angle"] == angles
+    assert told["cross_section"] == {"KNOWN": 11, "SATURATED": 1}
+    assert told["level_reflectance"] == {"KNOWN": 10, "SATURATED": 1, "UNSETTLED": 1}
+
+
+def test_relative_columns_become_absolute_with_the_constant():
+    block, echoes, _ = make(np.full(20, 30.0), snr=300.0)
+    angles = run(block, echoes, SYSTEM, "incidence_angle")
+    bare = SYSTEM.with_radiometry(constant=None, divergence=None, channels={(1, 0): (5.2e-8, 0.0)})
+    area = np.pi / 4 * BEAM**2
+    names = {"backscatter": "backscatter_coefficient", "cross_section": "cross_section", "reflectance": "reflectance"}
+    by_echo = {"reflectance": {"surface": "echo"}, "relative_reflectance": {"surface": "echo"}}
+    for name, other in names.items():
+        relative = run(block, angles, bare, f"relative_{name}", **by_echo).attributes
+        absolute = run(block, angles, SYSTEM, other, **by_echo).attributes
+        for end in ("", "_err"):
+            scaled = 2.6e-8 * (area if name == "cross_section" else 1.0) * relative[f"relative_{name}{end}"]
+            assert scaled == pytest.approx(absolute[f"{other}{end}"], rel=1e-5)
+
+
 def test_channels_have_constants_of_their_own():
     block, echoes, _ = make(np.full(20, 30.0), snr=300.0)
     one = run(block, echoes, SYSTEM, "backscatter_coefficient").attributes["backscatter_coefficient"]

@@ -7,6 +7,7 @@ from helpers_scenes import make_block, make_scene
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.physics.radiometry import backscatter
 from wavebatch.tools.simulate import (
     SCENES,
@@ -62,6 +63,26 @@ def test_samples_hold_the_truth(name):
     residual = (block.samples - recording.baseline - signal)[clear]
     assert abs(residual.mean()) < 0.05
     assert residual.std() == pytest.approx(np.hypot(recording.recorded_noise, recording.baseline_spread), rel=0.02)
+
+
+@pytest.mark.parametrize("name", list(render.PULSES))
+@pytest.mark.parametrize(("ringing", "factor"), [(0.0, 1.0), (0.03, 1.0), (0.03, 1.7)])
+def test_every_pulse_peaks_at_the_amplitude(name, ringing, factor):
+    pulse = find_pulse(name).with_ringing(ringing)
+    recording, sigma = Recording(n_samples=4000, spacing=0.02, pulse=pulse), np.array([pulse.sigma * factor])
+    signal = render.paint_echoes(recording, 1, np.array([0]), np.array([30.0]), np.array([100.0]), sigma)[0]
+    assert signal.max() == pytest.approx(100, rel=1e-3)
+    # The Gaussian that fits a flat target's pulse lies at its time; a target that widens it moves it a little.
+    datum = fit_one_gaussian(np.arange(4000) * 0.02, signal)[0]
+    assert datum == pytest.approx(30.0, abs=0.001 if factor == 1.0 else 0.8)
+
+
+def test_slope_widens_echoes():
+    scene = find_scene("slope")
+    _, truth = make_block("slope", 30_000, seed=6)
+    rays = render.trace_rays(render.FlightLine(), scene.terrain, np.arange(30_000))
+    wider = 0.5e-3 * scene.divergence * rays.distance * np.tan(rays.incidence) / 0.299792458
+    assert np.degrees(rays.incidence).max() > 50 and np.allclose(truth.sigma, np.hypot(2.0, wider), rtol=1e-5)
 
 
 def test_the_after_pulse_of_riegl():
