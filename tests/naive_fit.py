@@ -164,7 +164,7 @@ def join_broad(y, std, fit, s, clip, white, **shape):
     share = p[0] * p[2] / np.sum(p[0] * p[2])
     time = share @ p[1]
     width = np.sqrt(share @ (p[2] ** 2 + (p[1] - time) ** 2))
-    target = chi2 + (p.shape[1] - 1) * least_fall(p, std, s)
+    target = chi2 + (p.shape[1] - 2) * s.acceptance + least_fall(p, std, s)
     if width < s.width_high:
         return fit
     one = np.array([[np.sum(p[0] * p[2]) / width], [time], [width]])

@@ -129,7 +129,7 @@ def test_no_broad_echo_bridges_two_others():
 def test_echoes_that_a_fit_missed_are_searched_again():
     """Pulses hardly wider than a sample, of hundreds of noises: a step to one echo more ends far off, and three free
     parameters of each leave nothing of a new one between two (docs/algorithms.md 2.3)."""
-    rng, m, width = np.random.default_rng(3), 300, 0.6
+    rng, m, width = np.random.default_rng(3), 600, 0.6
     number = rng.integers(4, 7, m)
     truth = [(np.exp(rng.uniform(4, 9, k)), 8 + np.cumsum(rng.uniform(1.0, 4.0, k))) for k in number]
     y = np.stack([sum(bell(t, a, width) for a, t in zip(*echoes, strict=True)) for echoes in truth])
@@ -138,7 +138,7 @@ def test_echoes_that_a_fit_missed_are_searched_again():
     options = {"width_ref": width, "width_low": 0.42, "width_high": 2.4, "prior_spread": 0.06, "max_echoes": 8}
     plain, found = (decompose(y, start, grow=True, thorough=thorough, **options) for thorough in (False, True))
     missed = plain.cost > 9 * 15 + LENGTH
-    assert missed.mean() > 0.1 and np.mean(found.cost > 9 * 15 + LENGTH) < 0.02
+    assert missed.mean() > 0.1 and np.mean(found.cost > 9 * 15 + LENGTH) < 0.01
     # Fits so stiff end at another minimum by a rounding: that of the twin is found as often.
     rows = np.flatnonzero(missed)[:8]
     twin = [naive_fit.decompose(y[i], 1.0, start[i], settings(grow=True, thorough=True, **options)) for i in rows]
@@ -176,6 +176,16 @@ def test_one_broad_echo_is_taken_where_it_explains_as_much_as_several():
     off = (slope.parameters[:, :3] - [100.0, 24.0, 10.0]) / slope.errors[:, :3]
     assert ((np.abs(off) < 1).mean(axis=0) > 0.5).all() and (np.abs(off.mean(axis=0)) < 0.3).all()
     assert (pair.number >= 2).all() and (pair.number == 2).mean() > 0.97
+
+
+def test_a_misfit_of_the_pulse_joins_no_ground_to_a_canopy():
+    """It may explain one fall of chi2, not one for each echo of the canopy."""
+    noise = np.random.default_rng(5).standard_normal((100, LENGTH))
+    height, time = [1500.0, 2800.0, 1500.0, 300.0], [10.0, 16.0, 22.0, 36.0]
+    start = np.tile(np.array([height, time, [3.0, 3.0, 3.0, 1.0]]), (100, 1, 1))
+    options = GROWING | {"width_ref": 1.0, "width_low": 0.7, "width_high": 4.0, "prior_spread": 0.1, "misfit": 0.03}
+    found = decompose(np.rint(bell(16, 3000, 6.0) + bell(36, 300, 1.0) + noise), start, std=1.04, **options)
+    assert len(np.unique(found.cluster[np.abs(found.parameters[:, 1] - 36) < 0.5])) > 95
 
 
 def draw_random(rng):

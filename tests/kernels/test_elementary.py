@@ -1,9 +1,9 @@
-"""Tables between their rows, by the library: the bits of NumPy's interp."""
+"""Tables between their rows by the library, with the bits of NumPy's interp; logarithms alone and in fours."""
 
 import numpy as np
 import pytest
 
-from wavebatch.kernels.elementary import interpolate
+from wavebatch.kernels.elementary import interpolate, log
 
 
 @pytest.mark.parametrize("rows", [2, 3, 12])
@@ -18,3 +18,12 @@ def test_a_table_without_its_places_is_refused():
     for at, table in ((np.zeros(3), np.zeros((2, 4))), (np.zeros(0), np.zeros((0, 4)))):
         with pytest.raises(ValueError, match="has no rows"):
             interpolate(np.zeros(5), at, table)
+
+
+@pytest.mark.parametrize("odd", [np.inf, np.nan, 0.0, -1.0, 5e-324])
+def test_logarithms_in_fours_are_those_of_single_numbers(rng, odd):
+    x = np.exp(rng.uniform(-300, 300, 41))
+    x[6] = odd
+    with np.errstate(all="ignore"):
+        assert log(x).tobytes() == np.concatenate([log(x[i : i + 1]) for i in range(len(x))]).tobytes()
+        np.testing.assert_allclose(log(x), np.log(x), rtol=1e-14)

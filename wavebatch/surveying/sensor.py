@@ -46,7 +46,8 @@ MARGIN = 30.0
 """Time of a trajectory that is kept before and after the strip [s]."""
 
 LARGEST_ANGLE = np.radians(2.0)
-"""Largest median angle between packet vectors and rays from a trajectory; above it, strip, clock or CRS differ."""
+"""Largest angle between packet vectors and rays from a trajectory, but for a tenth of them; above it, strip, clock or
+CRS differ."""
 
 FOOT = 0.3048
 """International foot [m]."""
@@ -520,10 +521,11 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
         return 0.0
     angle, most = (quantile(np.arccos(cosine), share) for share in (0.5, 1.0 - MOST_MISS))
     if most > LARGEST_ANGLE:
+        share, off = ("half", angle) if angle > LARGEST_ANGLE else ("a tenth", most)
         raise InputError(
-            f"the trajectory's rays are {np.degrees(most):.1f} degrees off the packets' vectors: it belongs to another "
-            "strip, or to a part of this one, has another CRS, or its clock is off by seconds (UTC is 18 s less than "
-            "GPS time)"
+            f"{share} of the trajectory's rays are {np.degrees(off):.1f} degrees off the packets' vectors: it belongs "
+            "to another strip, or to a part of this one, has another CRS, or its clock is off by seconds (UTC is 18 s "
+            "less than GPS time)"
         )
     return angle
 

@@ -190,7 +190,8 @@ static void join_broad(const Settings *s, Work *work) {
     if (width < s->width_high) return;
     limits.high[2] = fmax(s->width_high, BROADEST * s->width_ref);
     work->fit.parameters[0] = area / width; work->fit.parameters[1] = time; work->fit.parameters[2] = width;
-    const double target = best->cost + (k - 1) * least_fall(s, k, a, work->window.std);
+    /* The pulse's misfit may explain one fall, not one for each: several proven echoes would fall together. */
+    const double target = best->cost + (k - 2) * s->acceptance + least_fall(s, k, a, work->window.std);
     fit_window(1, 3, s, &limits, &none, target, work);
     if (!work->fit.hopeless && work->fit.converged && work->fit.cost < target) describe_fit(s, &limits, work, &work->best);
 }
@@ -309,7 +310,7 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
         if (s->whitened && s->grow) find_new_energy(&work);
         if (decompose_window(s, clusters, i, &work) < 0) { i = -1; break; }
-        if (s->thorough && work.best.k > 1) join_broad(s, &work);
+        if (s->thorough && work.best.k > 1 && !(s->skew_spread > 0)) join_broad(s, &work);
         if (s->known > 0) leave_out_unknown(s, &work);
         if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
         if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);
