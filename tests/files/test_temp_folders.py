@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import shutil
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk import temp_store
+from wavebatch.files.disk import publish, temp_store
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="file locks of POSIX systems")
@@ -99,6 +100,20 @@ def test_processes_that_start_together_leave_each_other_alone(tmp_path):
     runs = [subprocess.Popen([sys.executable, "-c", LIVE_AND_LET_LIVE, str(tmp_path)]) for _ in range(4)]
     assert [run.wait(timeout=300) for run in runs] == [0] * 4
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_was_removed_meanwhile_says_nothing_of_its_folder(tmp_path):
+    """Two processes find the same folder left over: the slower one waits at a lock that is no more, and a third process
+    has made the folder its own since."""
+
+    def open_lock(folder):
+        descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT)
+        (folder / "lock").unlink()
+        (folder / "lock").write_text("of the new owner")
+        return descriptor
+
+    assert publish.remove_unlocked([tmp_path], open_lock, shutil.rmtree) == []
+    assert (tmp_path / "lock").read_text() == "of the new owner"
 
 
 def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):

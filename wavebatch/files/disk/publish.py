@@ -152,8 +152,9 @@ def remove_unlocked(
             descriptor = open_lock(path)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                remove(path)
-                removed.append(path)
+                if os.fstat(descriptor).st_nlink > 0:  # else another process took it, and the path has a new owner
+                    remove(path)
+                    removed.append(path)
             finally:
                 os.close(descriptor)
     return removed
