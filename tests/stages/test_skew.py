@@ -13,8 +13,8 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.stages.chain import parse_chain
+from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.measuring.residuals import decompose_sample
-from wavebatch.surveying.systems import skew
 from wavebatch.tools.compare_chains import measure_fit
 
 LEARNED = ((1.0, 0.0, 2.0), (0.3, 3.0, 2.4), (0.02, 9.0, 2.0))
@@ -154,7 +154,7 @@ def test_a_skew_at_its_limit_is_not_one_of_the_strip(monkeypatch):
             getattr(solution, name)[odd] = name == "at_bound"
             return solution
 
-        monkeypatch.setattr(skew, "decompose_clusters", fit)
+        monkeypatch.setattr(learn_pulse, "decompose_clusters", fit)
         table = decompose_sample(block, echoes.system)
-        found[name] = skew.measure_skew(block, echoes.system, table)
+        found[name] = learn_pulse.measure_skew(block, echoes.system, table)
     assert found["at_bound"] == found["converged"] and found["at_bound"].skew == pytest.approx(0.23, abs=0.03)

@@ -11,9 +11,9 @@ from writer_tools import data_file
 
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import survey
+from wavebatch.surveying.look import find_contradiction
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import known_systems
-from wavebatch.surveying.systems.saved_check import find_contradiction
 from wavebatch.surveying.systems.survey_result import load_survey
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 

@@ -14,7 +14,6 @@ from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
-from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.measuring.joint_pulse import stack_jointly
 from wavebatch.surveying.measuring.judge import explain
@@ -362,7 +361,7 @@ def test_noise_that_grows_with_the_signal_makes_no_narrow_pulse(gain):
 def test_coloured_noise_is_no_slope(riegl):
     """Its slopes scatter by twice what white noise does: every second waveform seemed to rise or fall by .025 DN/ns."""
     with StripReader(riegl) as reader, reader.scan() as scan:
-        blocks = list(reader.sample_blocks(scan, 2 * sample_size(reader, scan)))
+        blocks = list(reader.sample_blocks(scan, 2 * reader.sample_size(scan)))
     system = survey_blocks([block.rows(slice(1, None, 2)) for block in blocks]).system
     assert system.defects.slope_spread == 0
 

@@ -57,6 +57,8 @@ class Key(NamedTuple):
     """The value where a file lacks the key, for a field without a default."""
     form: str = "numbers"
     """What a list holds, for messages, e.g. `[lag, share]`."""
+    averaged: bool = False
+    """Of several digitizers the mean by their waveforms is taken."""
     shown: str = ""
     """Its line in the text of a result, where it is known: name, colon, and words with the value as `{}`."""
 

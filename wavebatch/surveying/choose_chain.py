@@ -15,8 +15,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
-import numpy as np
-
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -121,15 +119,6 @@ def widest_chain() -> Chain:
     return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0))
 
 
-SAMPLE = 8192
-"""Waveforms that a survey looks at."""
-
-SAMPLE_SAMPLES = 1 << 21
-"""Most samples that a survey reads: 8192 waveforms of 256 samples."""
-
-LEAST_WAVEFORMS = 64
-"""Waveforms that it reads even if they are long."""
-
 COSTS = ("fast", "balanced", "accurate")
 """The shipped chains by computing time, the fastest first; measured by `wavebatch bench`."""
 
@@ -203,14 +192,7 @@ def read_sample(reader: StripReader, scan: StripScan, waveforms: int | None = No
     list of WaveformBlock
         One block per digitizer, the one with the most samples first; empty for a strip without waveforms.
     """
-    return join_digitizers(reader.sample_blocks(scan, waveforms or sample_size(reader, scan)))
-
-
-def sample_size(reader: StripReader, scan: StripScan) -> int:
-    """Return how many waveforms of a strip a survey reads."""
-    used = (digitizer for index, digitizer in reader.facts.digitizers.items() if index in scan.by_descriptor)
-    longest = max((digitizer.n_samples for digitizer in used), default=0)
-    return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, SAMPLE))
+    return join_digitizers(reader.sample_blocks(scan, waveforms or reader.sample_size(scan)))
 
 
 def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Request) -> ChainChoice:

@@ -34,7 +34,6 @@ from wavebatch.kernels.geometry.planes import in_two_lines
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, find_single
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
@@ -474,7 +473,7 @@ def sample_reference(
     -------
     Reference
     """
-    samples = sample_slopes(reader, scan, source, sample_size(reader, scan) // OF_SAMPLE)
+    samples = sample_slopes(reader, scan, source, reader.sample_size(scan) // OF_SAMPLE)
     return measure_reference(samples, system, spacing)
 
 

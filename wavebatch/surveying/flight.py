@@ -22,13 +22,21 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.surveying.choose_chain import decide, sample_size
+from wavebatch.surveying.choose_chain import decide
 from wavebatch.surveying.inspect_strip import doubt_files
-from wavebatch.surveying.look import Glance, compare_echoes, compare_looks, glance_at, kind_of, look_at, read_flight
+from wavebatch.surveying.look import (
+    HELD,
+    Glance,
+    compare_echoes,
+    compare_looks,
+    glance_at,
+    kind_of,
+    look_at,
+    read_flight,
+)
 from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH
 from wavebatch.surveying.survey import survey_blocks
 from wavebatch.surveying.systems.figures import Kind, Look
-from wavebatch.surveying.systems.saved_check import HELD
 from wavebatch.surveying.systems.survey_result import SavedSurvey
 
 LEAST_SHARE = 64
@@ -153,7 +161,7 @@ def _read_sample(
     """The share of one of the strips, or why it cannot be read."""
     try:
         with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
-            share = waveforms or sample_size(reader, scan)
+            share = waveforms or reader.sample_size(scan)
             share = max(-(-share // strips), 1 if waveforms else LEAST_SHARE)
             blocks = tuple(reader.sample_blocks(scan, share))
             warnings = [asdict(one) for one in doubt_files(reader.facts, scan)]
@@ -255,7 +263,7 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str
     surveyed = flight.fingerprint.get("strips")
     if isinstance(surveyed, list) and {**fingerprint, "compared": True} in surveyed:
         return ""
-    number = min(HELD, sample_size(reader, scan))
+    number = min(HELD, reader.sample_size(scan))
     sample = StripSample(reader.facts.path, fingerprint, tuple(reader.sample_blocks(scan, number)))
     return _hold((sample, None), flight.survey.system, whole, kinds).reason if sample.blocks else ""
 

@@ -360,9 +360,9 @@ def survey(
     """
     from wavebatch.surveying.choose_chain import decide, read_sample  # `info` needs none of these
     from wavebatch.surveying.flat_ground import survey_angles
+    from wavebatch.surveying.look import with_look
     from wavebatch.surveying.outgoing import compare_outgoing
     from wavebatch.surveying.survey import survey_blocks
-    from wavebatch.surveying.systems.saved_check import with_look
 
     if not isinstance(strip, Strip):
         with open_strip(strip) as opened:

@@ -20,11 +20,11 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.calibration import Calibration, needs_sensor
 from wavebatch.surveying.choose_chain import ChainChoice, Request, make_choice
+from wavebatch.surveying.look import check_saved
 from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.matching.strip_match import match_strip
 from wavebatch.surveying.measuring.return_scatter import measure_returns
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
-from wavebatch.surveying.systems.saved_check import check_saved
 
 
 class Positions(Enum):

@@ -12,6 +12,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.order import median, quantile
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
+from wavebatch.files.toml_file import list_entries
 from wavebatch.kernels.signal.defects import find_seam
 from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
 from wavebatch.stages.flags import RINGING_REACH
@@ -19,7 +20,7 @@ from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
 from wavebatch.surveying.measuring.choose_pulse import bear, choose_pulse, settle
 from wavebatch.surveying.measuring.judge import SURE
-from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse
+from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse, measure_skew
 from wavebatch.surveying.measuring.misfit import (
     LEAST_MISFIT,
     MOST_FAINT,
@@ -53,7 +54,6 @@ from wavebatch.surveying.measuring.whitening import choose_whitening, lower_nois
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import guess_width, list_known, share_repeated
-from wavebatch.surveying.systems.skew import measure_skew
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
 NARROWER = 0.85
@@ -124,7 +124,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
                 named.append(Decision(f"digitizer {block.digitizer.index}", True, reason))
             counts.append(len(block))
             scenes.append(_describe(block, own, decompose_sample(block, own), Figures()))
-        names = ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share")
+        names = [one.field for one in list_entries(Figures) if one.key.averaged]
         shares: dict[str, Any] = {
             name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names
         }

@@ -42,6 +42,15 @@ LONG, LONG_SAMPLES = 2048, 1 << 17
 """Of waveforms with more samples than LONG a sample of the strip has at most LONG_SAMPLES samples. No sensor records so
 much of one pulse; where all of it is echoes, a survey takes 50 us per sample, twenty times as long as the chain."""
 
+SAMPLE = 8192
+"""Waveforms that a survey looks at."""
+
+SAMPLE_SAMPLES = 1 << 21
+"""Most samples that a survey reads: 8192 waveforms of 256 samples."""
+
+LEAST_WAVEFORMS = 64
+"""Waveforms that it reads even if they are long."""
+
 
 @frozen(eq=False)
 class PacketTable:
@@ -273,6 +282,12 @@ class StripReader(Closing):
         for unit in self.read_units(scan):
             for block, _ in self.read_blocks(unit, size, owned_only=True):
                 yield block
+
+    def sample_size(self, scan: StripScan) -> int:
+        """Return how many waveforms of the strip a survey reads."""
+        used = (digitizer for index, digitizer in self.facts.digitizers.items() if index in scan.by_descriptor)
+        longest = max((digitizer.n_samples for digitizer in used), default=0)
+        return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, SAMPLE))
 
     def sample_blocks(
         self, scan: StripScan, n_waveforms: int, size: int = 4096, *, long_samples: int = LONG_SAMPLES

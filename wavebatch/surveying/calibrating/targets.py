@@ -32,13 +32,12 @@ from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.geometry.planes import fit_facet
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.clean import clean_block
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.calibrating.calibration_files import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
 from wavebatch.surveying.measuring.noise_and_width import find_single
-from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
+from wavebatch.surveying.measuring.residuals import decompose_sample, describe_own, subtract_echoes
 from wavebatch.surveying.sensor import SensorSource
 
 SAMPLE, BLOCK = 4096, 512
@@ -103,20 +102,19 @@ def _describe(block: WaveformBlock, system: SystemPulse) -> Iterator[tuple[int, 
         return
     part = block.rows(echoes.waveform)
     echoes = replace(echoes, waveform=np.arange(len(echoes), dtype=np.int32))
-    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
-    place = np.stack([echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1)
-    height, time, width = model_parameters(shape, limits, place.astype(np.float64)).T[:, :, None]
+    shape, main = describe_own(system, echoes, block.spacing)
+    (height, time, width), amplitude = main.T[:, :, None], echoes.amplitude.astype(np.float64)
     basis = np.stack(evaluate_pulse(shape, np.arange(block.samples.shape[1], dtype=np.float64), time, width), axis=1)
     left = subtract_echoes(part, system, echoes).astype(np.float64)
     basis *= np.isfinite(left)[:, None]
     left = np.nan_to_num(left) / height
-    missing = (basis[:, 0] * height / place[:, :1]) ** 2
+    missing = (basis[:, 0] * height / amplitude[:, None]) ** 2
     inner = np.einsum("nis,njs->nij", basis, basis) + 1e-9 * np.eye(3)  # a pulse between two samples has no width
     taken = np.linalg.solve(inner, np.einsum("nis,ns->ni", basis, missing)[..., None])[..., 0]
     rest = missing - np.einsum("ni,nis->ns", taken, basis)
     with np.errstate(invalid="ignore", divide="ignore"):
         share = -np.einsum("ns,ns->n", left, rest) / np.einsum("ns,ns->n", rest, rest)
-    rows = np.stack([place[:, 0], share, taken[:, 0] + taken[:, 2]])
+    rows = np.stack([amplitude, share, taken[:, 0] + taken[:, 2]])
     scanner = np.zeros(len(part), np.int64) if part.scanner is None else part.scanner
     for number in np.unique(scanner).tolist():
         yield SCANNERS * block.digitizer.index + number, rows[:, (scanner == number) & np.isfinite(share)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import median, quantiles
 from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.describe import (
     SampleNoise,
@@ -26,13 +27,11 @@ from wavebatch.kernels.fit.describe import (
     measure_changes,
     render_pulses,
 )
-from wavebatch.stages.clean import clean_block
-from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import matched_filter
 from wavebatch.stages.flags import misfit_factor, scale_errors
-from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import clip_level, floor_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import clip_level, floor_level
 from wavebatch.surveying.measuring.noise_and_width import find_edge
+from wavebatch.surveying.measuring.residuals import describe_own, find_echoes
 
 WIDER = 1.0 + 0.02 * 2.0 ** np.arange(-0.5, 9.0)
 """Upper ends of the uniform laws, from the pulse's own width on, that make up the widths' density: any density that
@@ -51,7 +50,7 @@ SURE = 3.0
 KNOWN, LEAST_KNOWN = 0.15, 10
 """Largest error of a width that tells of the density of widths, as a share of it; fewest widths that do."""
 
-SEARCH = {"max_echoes": 6, "thorough": False}
+SEARCH: dict[str, Any] = {"max_echoes": 6, "thorough": False}
 """How far fits of a survey look for echoes: one that explains all with ever more of them hides what a pulse misses."""
 
 _DOUBTFUL = np.uint16(EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED | EchoFlag.MERGED)
@@ -72,11 +71,9 @@ def explain(
 
     Errors are those of noise alone: else a larger misfit would make every description shorter.
     """
-    block, noise, echoes = find_echoes(block, system, detect, **options)
+    block, noise, echoes = find_echoes(block, system, detect, **SEARCH | options)
     echoes = scale_errors(echoes, 1 / misfit_factor(echoes, system, block.spacing))
-    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
-    whole = np.stack([echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1)
-    main = model_parameters(shape, limits, whole.astype(np.float64))
+    shape, main = describe_own(system, echoes, block.spacing)
     n, s = block.samples.shape
     model = render_pulses(shape, n, s, echoes.waveform, main)
     used = block.samples < clip_level(block, system)
@@ -85,15 +82,6 @@ def explain(
     left = np.where(used, block.samples - noise.level - model, np.float32(0))
     left[(block.samples <= floor_level(system)) & (left > 0)] = 0  # an undershoot that was cut off is as any model says
     return Explained(echoes, Sums(shape, count_echoes(echoes.waveform, n), main, left, model, used))
-
-
-def find_echoes(
-    block: WaveformBlock, system: SystemPulse, detect: Callable[..., EchoTable] = matched_filter, **options: float
-) -> tuple[WaveformBlock, Noise, EchoTable]:
-    """As `explain`, without what echoes leave: the block as it was decomposed, its noise, echoes with all errors."""
-    block = clean_block(block, system)
-    noise = pooled_noise(block, system)
-    return block, noise, adaptive(block, noise, system, detect(block, noise, system), **SEARCH | options)
 
 
 def find_changed(one: Explained, other: Explained) -> np.ndarray:

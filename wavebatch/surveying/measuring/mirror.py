@@ -16,7 +16,8 @@ from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.detect.direct import matched_filter, maximum
 from wavebatch.stages.score import match_echoes
-from wavebatch.surveying.measuring.judge import Explained, find_echoes
+from wavebatch.surveying.measuring.judge import SEARCH, Explained
+from wavebatch.surveying.measuring.residuals import find_echoes
 
 STRONG = 30.0
 """Amplitude of a main echo, over the noise: a misfit of 3 % is then no more than noise."""
@@ -79,7 +80,7 @@ def look_in_mirror(
     false = []
     # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse.
     for detect in (matched_filter, maximum):
-        other = find_echoes(mirrored, system, detect)[2]
+        other = find_echoes(mirrored, system, detect, **SEARCH)[2]
         alone = np.ones(len(other), bool)
         alone[match_echoes(other, echoes, SAME * width).found] = False
         rest = other.take(np.flatnonzero(alone))

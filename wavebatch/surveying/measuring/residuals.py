@@ -5,6 +5,7 @@ The survey takes its noise from here once it has a pulse (docs/algorithms.md R3,
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 
@@ -13,9 +14,10 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import distinct, group_medians, median, quantile, quantiles
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
-from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import render_pulses
+from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.kernels.signal.noise import DRIFT, MOST_LEAST, floor_share, residual_noise
 from wavebatch.stages.clean import clean_block
@@ -71,11 +73,18 @@ def hides_noise(noise: ReceiverNoise) -> bool:
     return noise.baseline < -SUNK * noise.quiet
 
 
-def decompose_sample(block: WaveformBlock, system: SystemPulse, **options: float) -> EchoTable:
+def find_echoes(
+    block: WaveformBlock, system: SystemPulse, detect: Callable[..., EchoTable] = matched_filter, **options: float
+) -> tuple[WaveformBlock, Noise, EchoTable]:
+    """Decompose with options of `decompose.adaptive`: the block as it was decomposed, its noise, and the echoes."""
     block = clean_block(block, system)
     noise = pooled_noise(block, system)
-    echoes = adaptive(block, noise, system, matched_filter(block, noise, system), **options)
-    return use_noise_errors(echoes, system, block.spacing)
+    return block, noise, adaptive(block, noise, system, detect(block, noise, system), **options)
+
+
+def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """Decompose waveforms as a run does; errors hold the noise as fits see it."""
+    return use_noise_errors(find_echoes(block, system)[2], system, block.spacing)
 
 
 def decompose_again(block: WaveformBlock, system: SystemPulse, before: SystemPulse, echoes: EchoTable) -> EchoTable:
@@ -125,11 +134,15 @@ def render_own(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rows: np.ndarray, number: int, length: int = 0
 ) -> np.ndarray:
     """Models of echoes (m,) added up in `number` rows of a length, else the block's; rows: the row of each echo."""
-    spacing = block.spacing
-    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
-    main = model_parameters(shape, limits, whole)
+    shape, main = describe_own(system, echoes, block.spacing)
     return render_pulses(shape, number, length or block.samples.shape[1], rows, main)
+
+
+def describe_own(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[PulseShape, np.ndarray]:
+    """The pulse of a system, and the parameters of its main component for each of m echoes, f8 (m, 3) [samples]."""
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1)
+    return shape, model_parameters(shape, limits, whole.astype(np.float64))
 
 
 def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:

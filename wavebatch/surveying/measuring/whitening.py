@@ -13,16 +13,17 @@ from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.stages.pulse_tables import noise_factors, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.judge import (
+    SEARCH,
     SURE,
     Explained,
     count_errors,
     describe_waveforms,
     exceed,
     explain,
-    find_echoes,
 )
 from wavebatch.surveying.measuring.mirror import look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import DITHERED, FEW, UNDITHERED, find_single, thin_samples
+from wavebatch.surveying.measuring.residuals import find_echoes
 
 LEAST_NOISE = 0.5
 """Noise of a sample below which rounding makes what a filter of neighbours sees [count]."""
@@ -142,7 +143,7 @@ def choose_whitening(
     explained = seen[1] if seen and seen[0] == plain else explain(block, plain)
     echoes = explained.echoes
     lone = echoes.waveform[find_single(echoes, len(block), system, STRONG)]
-    left = find_echoes(block.rows(lone), whitened, max_echoes=1)[2].residual.astype(np.float64) ** 2
+    left = find_echoes(block.rows(lone), whitened, **SEARCH | {"max_echoes": 1})[2].residual.astype(np.float64) ** 2
     if len(left) < FEW:
         return plain
     typical = median(left)

@@ -27,6 +27,9 @@ MOST_FIGURE = 1e30
 
 Figure = Annotated[float | None, Range(-MOST_FIGURE, MOST_FIGURE), Key()]
 Share = Annotated[float | None, Range(0.0, 1.0), Key()]
+Scene = Annotated[float | None, Range(-MOST_FIGURE, MOST_FIGURE), Key(averaged=True)]
+"""Of the scene, which all digitizers of a strip see."""
+SceneShare = Annotated[float | None, Range(0.0, 1.0), Key(averaged=True)]
 Number = Annotated[float, Range(-MOST_FIGURE, MOST_FIGURE), Key()]
 Size = Annotated[float, Range(0.0, MOST_FIGURE), Key()]
 
@@ -107,14 +110,14 @@ class Figures:
     inverted: Figure = None
     least_count: Figure = None
     largest_count: Figure = None
-    empty_share: Share = None
+    empty_share: SceneShare = None
     """Of the waveforms; so are the next two."""
-    single_share: Share = None
-    overlapped_share: Share = None
-    echoes_per_waveform: Figure = None
+    single_share: SceneShare = None
+    overlapped_share: SceneShare = None
+    echoes_per_waveform: Scene = None
     amplitude_50: Figure = None
     amplitude_99: Annotated[Figure, Key(shown="amplitudes: 99 % below {:.1f} DN")] = None
-    saturated_share: Share = None
+    saturated_share: SceneShare = None
     system_width_share: Share = None
     """Clear echoes that have the width of the system pulse."""
     descriptors_pooled: Figure = None

@@ -50,13 +50,13 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.publish import reporting
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import SAMPLE, StripReader
 from wavebatch.files.strip.scanner import expand
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain import STAGES, Chain, Step, effective, load_chain_file, load_profile
 from wavebatch.stages.score import QUANTITIES
 from wavebatch.surveying import survey_blocks
-from wavebatch.surveying.choose_chain import SAMPLE, choose_chain
+from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.look import pool_blocks
 from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench import accuracy

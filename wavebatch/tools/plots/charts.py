@@ -21,7 +21,6 @@ from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.systems.survey_result import sample_pulse
 from wavebatch.tools.cells import Raster, Tally, choose_grid, compute_cells, find_shown, robust_limits
 from wavebatch.tools.compare_chains import find_residual
@@ -293,7 +292,7 @@ def draw_waveforms(path: Path, chain: Chain, system: SystemPulse, name: str, **r
     kept: tuple[list[tuple[float, WaveformView]], ...] = ([], [])
     with StripReader(path, **reading) as reader, reader.scan() as scan:
         total = scan.packets
-        for block in reader.sample_blocks(scan, min(SEARCHED, sample_size(reader, scan))):
+        for block in reader.sample_blocks(scan, min(SEARCHED, reader.sample_size(scan))):
             searched += len(block)
             residual = measure_view_residuals(block, chain, system)
             # The least keys of all blocks are kept; those of random numbers draw each waveform with the same chance.
