@@ -113,7 +113,7 @@ def test_points_whose_packets_are_lost_warn_in_cron_too(tiny_strip, tmp_path, ed
         return points
 
     (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "cut.las", break_some), tmp_path, code=3)
-    assert "have a packet past the end of the waveform data" in line
+    assert "with a packet past the end of the waveform data" in line
 
 
 def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):

@@ -46,7 +46,8 @@ def test_texts_longer_than_the_record_are_refused():
 
 @pytest.mark.parametrize(
     ("stored", "name"),
-    [(b"T\xb0", "T\N{DEGREE SIGN}"), (b"\xb0" * 32, "\N{DEGREE SIGN}" * 16), (b"a" * 31 + b"\xb0", "a" * 31)],
+    [(b"T\xb0", "T\N{DEGREE SIGN}"), (b"\xb0" * 32, "\N{DEGREE SIGN}" * 16), (b"a" * 31 + b"\xb0", "a" * 31),
+     (b"a" * 31 + b"\xc3", "a" * 31)],
 )
 def test_latin_1_texts_become_utf_8(stored, name):
     record = ExtraRecord(bytes([0, 0, 3, 0]) + stored.ljust(32, b"\0") + bytes(124) + stored.ljust(32, b"\0"))

@@ -14,6 +14,7 @@ from writer_tools import facts_of, plan_output, write_source, write_strip
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.las.header import (
     STANDARD_DTYPES,
+    decode_text,
     encode_evlr_header,
     find_evlrs,
     list_dimensions,
@@ -36,6 +37,19 @@ def test_what_is_no_las_file_is_one_line(tmp_path, data, message):
     with pytest.raises(InputError, match=message) as caught:
         read_header(tmp_path / "a.las")
     assert str(caught.value).startswith(str(tmp_path / "a.las")) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stored", "text"),
+    [
+        ("Zürich".encode(), "Zürich"),
+        ("Zürich".encode("latin-1"), "Zürich"),
+        (b"Caf\xe9", "Café"),  # the first byte of a letter of UTF-8 that is not cut, for the field has room
+        (b"s" * 31 + "ü".encode()[:1], "s" * 31),
+    ],
+)
+def test_texts_of_headers_are_utf_8_or_latin_1(stored, text):
+    assert decode_text(stored.ljust(32, b"\0")) == text
 
 
 def test_evlrs_end_where_the_file_does(tmp_path):

@@ -439,7 +439,8 @@ def test_odd_lengths_are_used_as_stored_and_said(tmp_path, factor):
     scan = scan_of(path)
     assert scan.vectors.form == "stored"
     # Yellowscan's are 3.5 % short.
-    assert "times c/2 long" in scan.warnings[0] if factor != 0.965 else scan.warnings == ()
+    said = "times c/2 long (usual: 0.96 to 1.00), as unit vectors are"
+    assert said in scan.warnings[0] if factor != 0.965 else scan.warnings == ()
     direction = next(iter(read_all(path).values()))[3]
     np.testing.assert_allclose(direction, -1000 * TOWARD * factor, rtol=1e-5)
 

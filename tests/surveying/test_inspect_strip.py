@@ -64,10 +64,10 @@ def test_check_gives_every_problem_a_line_with_its_place(tmp_path):
     path = make_bad(tmp_path)
     lines = run("check", path).stdout.splitlines()
     for text in (
-        "1 points (first: point 3) have a packet past the end of the waveform data",
-        "2 points (first: point 4) refer to a descriptor that the header does not have",
-        "1 points (first: point 8) have an impossible return location or packet vector",
-        "1 points have packets with fewer samples than their descriptor gives",
+        "1 point (first: point 3) with a packet past the end of the waveform data",
+        "2 points (first: point 4) with a descriptor that the header does not have",
+        "1 point (first: point 8) with an impossible return location or packet vector",
+        "1 point with packets of fewer samples than their descriptor gives",
     ):
         assert sum(text in line for line in lines) == 1, text
     assert all(line.startswith(f"{path}: ") for line in lines)

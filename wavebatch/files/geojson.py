@@ -174,8 +174,8 @@ def describe_miss(rings: Sequence[np.ndarray], header: LasHeader) -> str:
         return ""
     left, low, right, high = extent
     return (
-        f"the area (x {left:.10g} to {right:.10g}, y {low:.10g} to {high:.10g}) lies outside the strip (x {west:.10g} "
-        f"to {east:.10g}, y {south:.10g} to {north:.10g}); is it in another CRS?"
+        f"the area (x {left:.10g} to {right:.10g}, y {low:.10g} to {high:.10g}) lies outside the strip, which by its "
+        f"header has x {west:.10g} to {east:.10g}, y {south:.10g} to {north:.10g}; is it in another CRS?"
     )
 
 

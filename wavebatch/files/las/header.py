@@ -14,6 +14,7 @@ unknown content.
 
 from __future__ import annotations
 
+import codecs
 import os
 import struct
 from collections.abc import Container, Iterable, Sequence
@@ -340,8 +341,12 @@ def read_evlr(path: Path, evlr: Evlr) -> bytes:
 
 
 def decode_text(data: bytes) -> str:
-    """Return a text field up to its first NUL; bytes that are not ASCII show as Latin-1."""
-    return data.split(b"\0")[0].decode("latin-1")
+    """Return a text field up to its first NUL: UTF-8, the last letter of which a full field may cut, else Latin-1."""
+    text, end, _ = data.partition(b"\0")
+    try:
+        return codecs.utf_8_decode(text, "strict", bool(end))[0]
+    except UnicodeDecodeError:
+        return text.decode("latin-1")
 
 
 def encode_evlr_header(user_id: bytes, record_id: int, length: int, description: bytes) -> bytes:
@@ -585,10 +590,9 @@ class ExtraRecord:
         data = bytearray(self.data)
         for at in (_AT_NAME, _AT_DESCRIPTION):
             text = self.data[at : at + TEXT_BYTES].split(b"\0")[0]
-            try:
-                text.decode()
-            except UnicodeDecodeError:
-                data[at : at + TEXT_BYTES] = _as_field(text.decode("latin-1"))
+            readable = decode_text(self.data[at : at + TEXT_BYTES])
+            if readable.encode() != text:
+                data[at : at + TEXT_BYTES] = _as_field(readable)
         return ExtraRecord(bytes(data))
 
     def with_name(self, name: str) -> ExtraRecord:

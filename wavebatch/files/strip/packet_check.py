@@ -158,8 +158,10 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
             "wrote them) and divided by minus the return location"
         )
     if not any(LEAST_RATIO <= length <= LARGEST_RATIO for length in (ratio, metres * ratio)):
-        odd = f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
-        warnings.append(odd)
+        warnings.append(
+            f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00), as unit vectors are, or those in "
+            "another unit than metres per ps; new echoes may lie wrong"
+        )
     (toward, away), (up, down) = tally.pairs, tally.heights
     pairs, heights = (
         "toward" if 0 < share * (one + other) <= one else "away" if 0 < share * (one + other) <= other else ""
@@ -321,16 +323,16 @@ class Reason(IntEnum):
 
 
 REASON_TEXTS = {
-    Reason.NO_DESCRIPTOR: "refer to a descriptor that the header does not have",
-    Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, too long, without spacing, or of more than 32 bits",
-    Reason.EMPTY: "have a packet without a whole sample",
-    Reason.CUT: "have a packet past the end of the waveform data",
-    Reason.OUTSIDE: "have a packet before the start of the waveform data",
-    Reason.NO_GEOMETRY: "have an impossible return location or packet vector (not a number, 0, or far too long)",
-    Reason.OVERFULL: "share one packet with more points than a pulse can have",
-    Reason.PACKED: "have samples of other than 8, 16 or 32 bits, and a packet size that fits neither whole bytes "
+    Reason.NO_DESCRIPTOR: "with a descriptor that the header does not have",
+    Reason.BAD_DESCRIPTOR: "with a descriptor that is empty, too long, without spacing, or of more than 32 bits",
+    Reason.EMPTY: "with a packet without a whole sample",
+    Reason.CUT: "with a packet past the end of the waveform data",
+    Reason.OUTSIDE: "with a packet before the start of the waveform data",
+    Reason.NO_GEOMETRY: "with an impossible return location or packet vector (not a number, 0, or far too long)",
+    Reason.OVERFULL: "in a packet of more points than a pulse can have",
+    Reason.PACKED: "with samples of other than 8, 16 or 32 bits, and a packet size that fits neither whole bytes "
     "nor packed samples of 10 or 12 bits",
-    Reason.DAMAGED: "have a compressed packet that is damaged",
+    Reason.DAMAGED: "with a compressed packet that is damaged",
 }
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import changeable, frozen
 from wavebatch.core.order import distinct, even_places, quantile
+from wavebatch.core.units import count
 from wavebatch.files.disk.raw_bytes import Closing, join_records, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
@@ -247,11 +248,13 @@ class StripScan(Closing):
 
 def describe_oddities(reasons: dict[check.Reason, tuple[int, int]], short: int) -> Iterator[str]:
     """Yield warnings about a strip that can be processed."""
-    for reason, (count, first) in reasons.items():
+    for reason, (number, first) in reasons.items():
         remedy = "; get it again, whole, then run with --resume" if reason is check.Reason.CUT else ""
-        yield f"{count} points (first: point {first}) {check.REASON_TEXTS[reason]}; they are written unchanged{remedy}"
+        where = f"{count(number, 'point')} (first: point {first})"
+        yield f"{where} {check.REASON_TEXTS[reason]}; written unchanged{remedy}"
     if short:
-        yield f"{short} points have packets with fewer samples than their descriptor gives; these samples are used"
+        where = count(short, "point")
+        yield f"{where} with packets of fewer samples than their descriptor gives; these samples are used"
 
 
 LONGEST_RUN = 64
