@@ -223,6 +223,8 @@ SETTINGS = [
     *(("run set -o out --dry-run", 2, words, {"set/wavebatch.toml": text}) for text, words in (
         ("[run]\njbos = 3\n", "has no option 'jbos'; did you mean 'jobs'?"),
         ("[run]\nconfig = 'x.toml'\n", "has no option 'config'"), ("run = 3\n", "must be a table"),
+        ("[runn]\ncolumns = 'range'\n", "there is no command 'runn' to give options to, as in [run]; did you mean"),
+        ("columns = 'range'\n", "there is no command 'columns'"), ("[run.range]\n", "has no option 'range'"),
         *((f"[run]\nprofile = {value}\n", "must not set profile so")
           for value in ("'../c.toml'", "'c.toml'", '"\\u001b[2Jfast"')),
         (f"[run]\ncolumns = '{'x' * 5000}'\n", "must not set columns so"),

@@ -69,6 +69,20 @@ def test_report_of_the_batch_to_a_file_and_to_stdout(tiny_strip, tmp_path):
     assert printed["counts"] == document["counts"] and printed["strips"][0]["status"] == "skipped"
 
 
+def test_resume_says_why_a_cloud_is_made_again(tiny_strip, tmp_path):
+    out = tmp_path / "a"
+    words = ("-o", out, "--resume", "--profile")
+    assert "made again" not in _run(tiny_strip, *words, "fast").stderr
+    assert "tiny.las: is made again: changed since: chain\n" in _run(tiny_strip, *words, "balanced").stderr
+    where = ("balanced", "--columns", "+echo_time", "--bbox", "0,0,1,1")
+    assert "changed since: columns, selection\n" in _run(tiny_strip, *words, *where).stderr
+    assert "changed since: bbox\n" in _run(tiny_strip, *words, *where[:-1], "0,0,1,2").stderr
+    (out / "tiny.laz").unlink()
+    assert "its cloud is missing or damaged\n" in _run(tiny_strip, *words, *where[:-1], "0,0,1,2").stderr
+    (out / "tiny.report.json").write_text("{")
+    assert "its report is damaged\n" in _run(tiny_strip, *words, "fast").stderr
+
+
 def test_progress_as_json_lines(tiny_strip, tmp_path):
     result = _run(tiny_strip, tmp_path / "none.las", "-o", tmp_path / "a", "--progress", "json", "-q")
     events = [json.loads(line) for line in result.stdout.splitlines()]

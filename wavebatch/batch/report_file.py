@@ -12,7 +12,7 @@ import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -206,7 +206,7 @@ def format_report(document: Mapping[str, Any]) -> str:
     return text.encode(errors="backslashreplace").decode() + "\n"
 
 
-def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> RunReport | None:
+def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> tuple[RunReport | None, str]:
     """Read the report of a cloud that is complete and equal to what this run would write.
 
     Parameters
@@ -219,23 +219,38 @@ def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> R
 
     Returns
     -------
-    RunReport or None
+    report : RunReport or None
         None where the cloud must be made.
+    why : str
+        Why it must be made though there is a report; else empty.
     """
+    why = ""
     # Whatever is wrong with a report, the cloud is made anew.
     wrong = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
     with contextlib.suppress(*wrong):
         with open(report_path(job, folder), "rb") as file:
+            why = "its report is damaged"
             document = json.loads(file.read(MOST_REPORT))
         if document["checksum"] != _sum_up(document):
-            return None
-        cloud = cloud_path(job, folder)
-        same = document["schema"] == STRIP_SCHEMA and all(
-            document[key] == json.loads(json.dumps(value)) for key, value in described.items()
-        )
-        if same and document["output"]["file"] == cloud.name and document["output"]["size"] == cloud.stat().st_size:
-            return RunReport.from_json(document)
-    return None
+            return None, why
+        asked = {"schema": STRIP_SCHEMA, **json.loads(json.dumps(described))}
+        changed = list(_list_changes(asked, {key: document.get(key) for key in asked}))
+        if changed:
+            return None, f"changed since: {', '.join(changed)}"
+        why, cloud, output = "its cloud is missing or damaged", cloud_path(job, folder), document["output"]
+        if output["file"] == cloud.name and output["size"] == cloud.stat().st_size:
+            return RunReport.from_json(document), ""
+    return None, why
+
+
+def _list_changes(new: Mapping[str, Any], old: Mapping[str, Any]) -> Iterator[str]:
+    """Names of the values that differ; of the input, whose hash says nothing to a reader, only that it does."""
+    for key in {**new, **old}:
+        one, other = new.get(key, ...), old.get(key, ...)
+        if isinstance(one, dict) and isinstance(other, dict) and key != "input":
+            yield from _list_changes(one, other)
+        elif one != other:
+            yield key
 
 
 _ANGLE = "incidence_angle"

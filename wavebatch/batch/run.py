@@ -253,7 +253,7 @@ class _Batch:
             with self._failing(strip):
                 strip.claim()
                 report = strip.start(self._workers.jobs)
-                self._tell({"event": "start", "strip": str(strip.job.path)})
+                self._tell({"event": "start", "strip": str(strip.job.path), "outdated": strip.outdated})
                 if report is None:
                     return strip
                 self._end(strip, Outcome(strip.job, "incomplete" if report.is_incomplete else "skipped", report))

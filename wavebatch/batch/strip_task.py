@@ -64,6 +64,8 @@ class StripTask:
         """Who takes the result of each."""
         self.prepared: Prepared | None = None
         self.written = 0
+        self.outdated = ""
+        """Why a cloud that has a report is made again."""
         self._options = options
         self._submitted = 0
         self._blob = b""
@@ -114,8 +116,10 @@ class StripTask:
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
         self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
-        if options.resume and (report := report_file.read_current(job, options.folder, self._described)) is not None:
-            return report
+        if options.resume:
+            report, self.outdated = report_file.read_current(job, options.folder, self._described)
+            if report is not None:
+                return report
         plan_filter(job, plan_layout(job, self.facts))  # a wrong option is named before outputs that exist
         for target in (report_file.cloud_path, report_file.report_path):
             check_target(target(job, options.folder), overwrite=options.overwrite or options.resume)

@@ -95,11 +95,11 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
         files = ", ".join(str(path) for key, path in beside.items() if key)
         raise click.UsageError(f"the inputs lie in folders with different settings ({files}); run them one by one, or "
                                "give --config FILE")
-    found = {path: _read_file(path, title, options, is_users=False) for key, path in beside.items() if key}
+    found = {path: _read_file(path, title, context, options, is_users=False) for key, path in beside.items() if key}
     if named or os.path.isfile(personal):
         given = {name for values in found.values() for name in values}
         barred = given.union(*(rivals for rivals in EXCLUSIVE if given.intersection(rivals)))
-        values = _read_file(personal, title, options, is_users=True)
+        values = _read_file(personal, title, context, options, is_users=True)
         found[personal] = {name: value for name, value in values.items() if name not in barred}
     if found:
         context.meta[READ] = found
@@ -153,7 +153,9 @@ def _folder(word: str) -> Path:
     return parent
 
 
-def _read_file(path: Path, title: str, options: Mapping[str, click.Option], *, is_users: bool) -> dict[str, Any]:
+def _read_file(
+    path: Path, title: str, context: click.Context, options: Mapping[str, click.Option], *, is_users: bool
+) -> dict[str, Any]:
     """Values of the command's table in the file, by name of the parameter; ConfigError becomes wrong usage.
 
     is_users: the user named the file or keeps it; else it may have come with the data.
@@ -165,15 +167,19 @@ def _read_file(path: Path, title: str, options: Mapping[str, click.Option], *, i
         table: Any = parse_toml(read_text(path, "settings file", MOST_BYTES), str(path)).values
     except ConfigError as error:
         raise click.UsageError(str(error)) from error
+    group: Any = context.find_root().command
     for part in title.split():
-        table = table.get(part, {}) if isinstance(table, dict) else {}
-    if not isinstance(table, dict):
-        raise click.UsageError(f"{path}: [{title}] must be a table of options")
+        commands = group.list_commands(context)
+        for name in table:
+            if name not in commands:
+                raise click.UsageError(f"{path}: there is no command {shorten(name)} to give options to, as in [run]; "
+                                       f"{nearest(name, commands)}")  # fmt: skip
+        table, group = table.get(part, {}), group.get_command(context, part)
+        if not isinstance(table, dict):
+            raise click.UsageError(f"{path}: [{title}] must be a table of options")
     known = {_option_name(one): name for name, one in options.items() if name != "config"}
     found = {}
     for key, value in table.items():
-        if isinstance(value, dict):
-            continue
         key = OLD_NAMES.get(f"--{key}", key).removeprefix("--") if key not in known else key
         if key not in known:
             raise click.UsageError(f"{path}: [{title}] has no option {shorten(key)}; {nearest(key, list(known))}")
@@ -181,8 +187,9 @@ def _read_file(path: Path, title: str, options: Mapping[str, click.Option], *, i
         harmless = key in HARMLESS and len(str(value)) <= LONGEST and (key != "profile" or str(value).isidentifier())
         if not is_users and not harmless:
             raise click.UsageError(
-                f"{path}: [{title}] must not set {key} so: a file that lies with the data may change numbers only; "
-                f"remove the line, or, if the whole file can be trusted, give --config {shlex.quote(str(path))}"
+                f"{path}: [{title}] must not set {key} so: a file that lies with the data may change numbers of the "
+                "result, not how or where it is made; remove the line, or, if the whole file can be trusted, give "
+                f"--config {shlex.quote(str(path))}"
             )
         found[known[key]] = _convert(value, options[known[key]], path)
     return found

@@ -93,6 +93,8 @@ class Progress(Closing):
                          for name, number in counts.items() if name != NoData.KNOWN.name]  # fmt: skip
             for line in [*more * (self._level > 0), *event["remarks"]]:
                 self._tell(f"{strip}: {line}")
+        elif kind == "start" and event["outdated"]:
+            self._tell(f"{strip}: is made again: {event['outdated']}")
         elif kind == "skipped":
             self._tell(f"{strip}: is up to date, skipped")
         elif kind == "flight" and self._level > 0:
