@@ -88,7 +88,7 @@ def test_rays_meet_a_hand_in_front_of_the_origins_of_the_pulses_in_the_pulsewave
     by_vectors = np.linalg.norm(point - source.trajectory.at(np.asarray(cloud.gps_time)), axis=1)
     off = by_vectors - np.linalg.norm(point - anchor[order][at], axis=1)
     # The facet of its mirror moves: rays meet in front of the origins, always by the same.
-    assert off.mean() == pytest.approx(-0.071, abs=0.003) and off.std() < 0.003
+    assert off.mean() == pytest.approx(-0.071, abs=0.003) and off.std() < 0.004
     assert source.error < 0.01
 
 
@@ -302,11 +302,15 @@ def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
     assert "\n" not in str(caught.value) and "project the strip" in str(caught.value)
 
 
+@pytest.mark.parametrize("turns", [0, 2, 4])
 @pytest.mark.parametrize(("apart", "meets"), [((0, 0, 0), True), ((30, 0, 0), False), ((0, 0, 150), False)])
-def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_path, apart, meets):
-    """Two flights of one time of the week: a path half way between them was 14 and 79 m off, with errors of 3 and 4."""
+def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_path, apart, meets, turns):
+    """Two flights of one time of the week: a path half way between them was 14 and 79 m off, with errors of 3 and 4.
+
+    Where they take turns, every eighth pulse is of one of them.
+    """
     trajectory = facet_strips.write_trajectory(tmp_path / "t.csv", Sensor(), 2.0)
-    first = np.random.default_rng(3).random(8000)[:, None] < 0.4
+    first = (np.arange(8000) % turns < turns // 2 if turns else np.random.default_rng(3).random(8000) < 0.4)[:, None]
     monkeypatch.setattr(facet_strips, "path_of", lambda sensor, seconds: path_of(sensor, seconds) + first * apart)
     strip = write_strip(tmp_path / "a.las", [Facet(0.3)], Sensor(rate=5000.0, n_samples=40), 8000)
     assert (find(strip).kind == "direction vectors") == meets

@@ -441,6 +441,9 @@ SCALE_PLACES = 16
 LEAST_PAIRS, SCALE_SPREAD = 20, 0.05
 """Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles."""
 
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+"""What steps through a strip have over a whole number: those that are one see one sensor only where two take turns."""
+
 _SLICES_PER_UNIT = 4
 _LEAST_RATIO, _LARGEST_RATIO = 0.3, 3.0
 """Vectors with other lengths over c/2 are no directions."""
@@ -485,7 +488,8 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
         far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
         middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
         pairs.append(RaySample(time[place[far]], middle, apart[far], square[far], away[place[far]]))
-        rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
+        step = len(points) // RAYS_PER_SLICE
+        rows = np.arange(0, len(points), step + GOLDEN if step > 1 else 1).astype(np.int64)
         rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
         kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows]))
         return float(time[0]), bool(np.count_nonzero(time[1:] < time[:-1]) > MIXED * len(time))

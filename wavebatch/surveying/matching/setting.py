@@ -6,10 +6,11 @@ makes another sensor of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.order import even_places, known_median, robust_std
@@ -126,6 +127,8 @@ class Change(NamedTuple):
     """Root mean square of the logarithm of that change, as far as the light shows it, from LIKELY on; less below."""
     spread: float = np.inf
     """How much surfaces change the ratio (standard deviation)."""
+    is_uneven: bool = False
+    """Whether the shift is that of parts of a strip about their mean, root mean square."""
 
 
 NO_CHANGE = Change(0.0, 0.0, 0.0)
@@ -203,7 +206,7 @@ def weigh_change(
 
 
 def compare_scenes(
-    one: Sequence[float], other: Sequence[float], noise: float | None = None, *, chance: float, usual: float = 0.0
+    one: ArrayLike, other: ArrayLike, noise: float | None = None, *, chance: float, usual: float = 0.0
 ) -> Change:
     """Weigh by how much one scene is brighter than another; noise, chance, usual: as `weigh_change`.
 
@@ -247,6 +250,11 @@ def compare_ground(
     off, whole = light - there[2, rows], np.hypot(robust_std(light), robust_std(there[2, rows]))
     if robust_std(off) > LIKE_GROUND * whole:
         return None
+    # Warming up, or failing for a time, moves parts of the strip.
+    parts = np.array_split(off[np.argsort(time, kind="stable")], len(np.unique(near[rows])) // LEAST_COMMON)
+    doubt = MEDIAN_ERROR * robust_std(off) * (len(parts) / len(off)) ** 0.5
+    moved = float(np.std([np.median(part) for part in parts]))
+    uneven = weigh_change(moved, float(np.hypot(doubt, SAME_GROUND)), chance=chance)._replace(is_uneven=True)
     # Neighbours on two sides of a field's border say nothing.
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
     off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
@@ -256,7 +264,8 @@ def compare_ground(
     if spread < SPAN:
         return level, None
     slope = float(np.polyfit(time, off, 1)[0])
-    return level, weigh_change(slope, float(np.hypot(error / spread, SAME_GROUND)), chance=chance)
+    even = weigh_change(slope, float(np.hypot(error / spread, SAME_GROUND)), chance=chance)
+    return level, uneven if even.chance <= LIKELY < uneven.chance else even
 
 
 def measure_setting(

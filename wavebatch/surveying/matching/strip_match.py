@@ -145,6 +145,11 @@ def compare_setting(
     """
     growth, lines, notes = 0.0, [], []
     unseen = usual
+    scenes = {
+        (row.digitizer, row.scanner): np.subtract(seen, row.scene)
+        for row in calibration.channels
+        if len(row.scene) == len(seen := found.scenes.get((row.digitizer, row.scanner), ())) > 0
+    }
 
     def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
         nonlocal growth
@@ -170,9 +175,20 @@ def compare_setting(
         scene = found.scenes.get((row.digitizer, row.scanner))
         if ground is None and (not scene or len(row.scene) != len(scene)):
             continue
-        seen, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
+        alike, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
         chance = calibration.change_chance
         change = change or settings.compare_scenes(scene or (), row.scene, louder, chance=chance, usual=usual)
+        rest = [one for channel, one in scenes.items() if channel != (row.digitizer, row.scanner)]
+        if ground is None and rest:
+            # Channels of one strip see the same surfaces, which then explain nothing. Either may be the wrong one.
+            alone = scenes[row.digitizer, row.scanner]
+            beside = settings.compare_scenes(alone, np.mean(rest, axis=0), chance=chance)
+            if beside.chance > settings.LIKELY:
+                growth = max(growth, math.expm1(abs(beside.shift)))
+                lines.append(
+                    f"calibration: light {which} over that of the strip's other channels is "
+                    f"{math.exp(beside.shift):.2f} times what it was: another gain, or constants of another channel"
+                )
         # What common ground shows is in the error, whatever changed it.
         more = math.expm1(max(change.error, abs(change.shift) * bool(ground or change.chance > settings.LIKELY)))
         growth, unseen = max(growth, more), 0.0
@@ -188,7 +204,7 @@ def compare_setting(
             lines.append(
                 f"calibration: another gain or energy under the same header, or haze: all echoes {which} are brighter "
                 f"by a factor of {math.exp(change.shift):.2f}, "
-                + ("and noise with them" if abs(louder or 0.0) > settings.SUNLIGHT else f"though {seen} alike")
+                + ("and noise with them" if abs(louder or 0.0) > settings.SUNLIGHT else f"though {alike} alike")
             )
     growth = math.hypot(growth, unseen)
     return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines], notes
@@ -221,6 +237,13 @@ def judge_fading(
     seen = max((ground[1] for ground in compared if ground and ground[1]), key=lambda one: one[1:3], default=fades)
     if seen.spread < fades.spread:
         fades, hidden = seen, "the scatter of the ground in common hides"
+    if fades.chance > settings.LIKELY and fades.is_uneven:
+        growth = math.expm1(abs(fades.shift))
+        return growth, [
+            f"calibration: over ground in common light changes along the strip, not evenly, by {100 * growth:.0f} % "
+            "(root mean square): a laser that warms up, or fails for a time, or haze? The error of the constant grows "
+            "by it; calibrate shorter strips"
+        ], []
     if fades.chance > settings.LIKELY:
         growth = math.expm1(FROM_START * abs(fades.shift))
         return growth, [
