@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from child_signals import give_children_default_signals
-from commands import run_command
+from commands import succeed
 
 import wavebatch
 from wavebatch.tools.simulate import simulate_strip
@@ -263,8 +263,7 @@ class Attacker:
         again = ["--resume", "--jobs", "1"] if name.startswith("run") else ["--overwrite"]
 
         def work() -> None:
-            done = run_command(*self._words(name, out)[3:], *again)
-            assert done.exit_code == 0, done.output
+            succeed(*self._words(name, out)[3:], *again)
 
         try:
             in_child(work)

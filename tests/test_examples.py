@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from batch_tools import read_cloud
-from commands import run_command
+from commands import succeed
 
 ROOT = Path(__file__).resolve().parent.parent
 CHAINS = sorted((ROOT / "examples").glob("*.toml"))
@@ -21,8 +21,7 @@ def test_there_is_a_chain_for_open_urban_and_forest_scenes():
 
 @pytest.mark.parametrize("chain", CHAINS, ids=lambda path: path.stem)
 def test_example_chains_run(chain, tiny_strip, tmp_path):
-    result = run_command("run", tiny_strip, "-o", tmp_path, "--chain", chain)
-    assert result.exit_code == 0, result.output
+    succeed("run", tiny_strip, "-o", tmp_path, "--chain", chain)
     cloud, _ = read_cloud(tmp_path / "tiny.laz")
     assert len(cloud) > 300
 

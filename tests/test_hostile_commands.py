@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from strips import make_raw
 
 from wavebatch.cli.messages import printable
@@ -99,8 +99,7 @@ def test_names_of_files_may_hold_anything(tmp_path, name):
     strip.write_bytes(make_raw(60).write(tmp_path / "plain.las").read_bytes())
     out = ["-o", str(tmp_path / "out"), "--profile", "fast"]
     for more in ([], ["--resume"]):
-        done = run_command("run", strip, *out, *more, "--report", tmp_path / "batch.json")
-        assert done.exit_code == 0, done.stderr
+        done = succeed("run", strip, *out, *more, "--report", tmp_path / "batch.json")
         assert all(line.startswith(printable(str(strip))) for line in done.stderr.splitlines()), done.stderr
         assert "\x1b" not in done.stderr
     assert "is up to date, skipped" in done.stderr

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import run_command
+from commands import succeed
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -66,8 +66,7 @@ def _wavebatch(environment, *words, **more) -> subprocess.CompletedProcess:
 def cloud(tiny_strip, tmp_path_factory) -> bytes:
     """The cloud of an undisturbed run."""
     folder = tmp_path_factory.mktemp("here")
-    done = run_command("run", tiny_strip, "-o", folder, "-q")
-    assert done.exit_code == 0, done.output
+    succeed("run", tiny_strip, "-o", folder, "-q")
     return (folder / "tiny.laz").read_bytes()
 
 

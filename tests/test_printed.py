@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from printed_figures import PAGES, renew, renew_page, split, strips_of
 
 from wavebatch.cli import COMMANDS
@@ -122,8 +122,7 @@ def make_inputs(line):
     """What a line reads and another page or line has made before it."""
     for name, words in MADE_BEFORE.items():
         if re.search(rf"(?<![\w/-]){re.escape(name)}(?![\w.])", line.partition(" -o ")[0]) and not Path(name).exists():
-            done = run_command(*shlex.split(words))
-            assert done.exit_code == 0, done.output
+            succeed(*shlex.split(words))
 
 
 @pytest.mark.slow

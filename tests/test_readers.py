@@ -16,7 +16,7 @@ import like_pdal
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command
+from commands import succeed
 
 import wavebatch as wb
 from wavebatch.core.echoes import COLUMNS
@@ -67,8 +67,7 @@ def make_cloud(request, tmp_path_factory):
 def _make_colours(folder, point_format, edit):
     """A strip of this point format with random colours."""
     words = ["simulate", "urban", "--pulses", "300", "--point-format", point_format, "-o", str(folder / "grey.las")]
-    result = run_command(*words)
-    assert result.exit_code == 0, result.output
+    succeed(*words)
 
     def paint(points):
         for name in {"red", "green", "blue", "nir"} & set(points.dtype.names):
@@ -218,8 +217,7 @@ def test_a_copc_file_of_copclib_is_a_cloud_like_any(make_cloud, tmp_path, case):
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=1e-6, err_msg=name)
     documents = []
     for one in (path, target):
-        result = run_command("stats", one, "--json")
-        assert result.exit_code == 0, result.output
+        result = succeed("stats", one, "--json")
         documents.append({**json.loads(result.stdout)["total"], "cloud": ""})
     assert documents[0] == documents[1]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command
+from commands import run_command, succeed
 from strips import cut_strip
 from writer_tools import data_file
 
@@ -169,8 +169,7 @@ def test_a_residual_threshold_below_the_noise_is_said(tiny_strip, tmp_path):
         chain = tmp_path / f"{t_diff}.toml"
         chain.write_text(f'{text}\nt_diff = {t_diff}\nt_unit = "count"\n{rest}')
         folder = tmp_path / f"out-{t_diff}"
-        done = run_command("run", tiny_strip, "-o", folder, "-c", chain)
-        assert done.exit_code == 0, done.stderr
+        succeed("run", tiny_strip, "-o", folder, "-c", chain)
         told = json.loads((folder / f"{tiny_strip.stem}.report.json").read_text())["remarks"]
         assert any("lies below the noise of" in line and "raised" in line for line in told) == raised
 
@@ -202,8 +201,7 @@ def many(tiny_strip, tmp_path):
 def test_summary_and_page_have_the_warnings_of_every_strip(many, tmp_path):
     page, out = tmp_path / "page.html", tmp_path / "out"
     task = ["run", str(many), "-o", str(out), "-q", "--profile", "fast", "--json", "--html", str(page)]
-    first = run_command(*task, "--fail-on", "nothing-selected")
-    assert first.exit_code == 0
+    first = succeed(*task, "--fail-on", "nothing-selected")
     again = run_command(*task, "--resume", "--fail-on", "lost-packets,empty")
     assert again.exit_code == 3 and "--fail-on" in again.stderr and "d.las" in again.stderr
     before, after = (json.loads(done.stdout)["strips"] for done in (first, again))

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from batch_tools import read_cloud, read_outputs
-from commands import run_command
+from commands import run_command, succeed
 from helpers_scenes import make_scene
 
 import wavebatch as wb
@@ -38,8 +38,7 @@ def strips(tmp_path_factory):
 def flown(strips, tmp_path_factory):
     """Clouds of a, b and the odd one with one survey, and what was said."""
     folder = tmp_path_factory.mktemp("flown")
-    result = _run(*(strips[name] for name in ("a", "b", "odd")), "-o", folder, "--survey", "flight")
-    assert result.exit_code == 0, result.output
+    result = succeed("run", *(strips[name] for name in ("a", "b", "odd")), "-o", folder, "--survey", "flight")
     return folder, result
 
 
@@ -83,8 +82,7 @@ def test_resume_takes_the_kept_survey_also_for_later_strips(strips, flown, tmp_p
 @pytest.mark.slow
 def test_the_order_and_the_jobs_do_not_matter(strips, flown, tmp_path):
     folder, _ = flown
-    result = _run(*(strips[name] for name in ("odd", "b", "a")), "-o", tmp_path, "--survey", "flight", "--jobs", 2)
-    assert result.exit_code == 0
+    succeed("run", *(strips[name] for name in ("odd", "b", "a")), "-o", tmp_path, "--survey", "flight", "--jobs", 2)
     expected = read_outputs(folder).items()
     assert read_outputs(tmp_path) == {name: content for name, content in expected if not name.startswith("c.")}
 

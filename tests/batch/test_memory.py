@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import succeed
 from strips import descriptor, make_raw
 from writer_tools import read_provenance
 
@@ -128,8 +128,7 @@ def test_the_account_of_many_digitizers_fits_into_the_cloud(tmp_path):
     raw.vlrs = [descriptor(i + 1, bits=16, samples=s, spacing=1000 + i) for i in range(k)]
     raw.points["wavepacket_index"] = 1 + np.arange(n) % k
     strip = raw.write(tmp_path / "a.las")
-    done = run_command("run", strip, "-o", tmp_path / "out", "--format", "las", "-q")
-    assert done.exit_code == 0, done.output
+    succeed("run", strip, "-o", tmp_path / "out", "--format", "las", "-q")
     (account,) = read_provenance(tmp_path / "out" / "a.las")
     report = json.loads((tmp_path / "out" / "a.report.json").read_text())
     left_out = account["left_out"]["sha256"]

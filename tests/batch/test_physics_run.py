@@ -8,14 +8,12 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from strips import take_turns
 
 from wavebatch.core.units import HALF_C
 from wavebatch.surveying.calibrating.calibration_files import format_calibration
-from wavebatch.surveying.calibration import (
-    Calibration,
-)
+from wavebatch.surveying.calibration import Calibration
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
@@ -37,8 +35,7 @@ def calibration(tmp_path_factory):
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory, tiny_strip, calibration):
     folder = tmp_path_factory.mktemp("plain")
-    done = run(tiny_strip, "-o", folder, "--profile", "fast", "--calibration", calibration)
-    assert done.exit_code == 0, done.output
+    succeed("run", tiny_strip, "-o", folder, "--profile", "fast", "--calibration", calibration)
     return folder
 
 
@@ -76,8 +73,7 @@ def test_errors_of_level_reflectances_take_the_slopes_of_the_strip(
     tmp_path, tiny_strip, calibration, monkeypatch, measured, used
 ):
     monkeypatch.setattr("wavebatch.surveying.flat_ground.measure_slope", lambda reader, scan: measured)
-    done = run(tiny_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration)
-    assert done.exit_code == 0, done.output
+    succeed("run", tiny_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration)
     assert f"slope = {used}\n" in report(tmp_path)["chain"]
 
 
@@ -86,8 +82,7 @@ def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, tmp_path_factory, edit
     plain = tmp_path_factory.mktemp("wide")
     strip = take_turns(Path(shutil.copy(wide_strip, plain / "s.las")), edit_points)
     for folder, options in ((plain, ()), (tmp_path, ("--jobs", "2", "--block-size", "999"))):
-        done = run(strip, "-o", folder, "--profile", "fast", "--calibration", calibration, *options)
-        assert done.exit_code == 0, done.output
+        succeed("run", strip, "-o", folder, "--profile", "fast", "--calibration", calibration, *options)
     assert next(tmp_path.glob("*.laz")).read_bytes() == next(plain.glob("*.laz")).read_bytes()
     told = report(plain)
     for name, counts in told["counts"]["no_data"].items():
@@ -102,8 +97,7 @@ def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
     strip, cal = tmp_path / "flat.las", tmp_path / "cal.toml"
     simulate_strip("flat", strip, pulses=12_000, seed=2)
     cal.write_text(format_calibration(replace(FOUND, divergence=0.3)))
-    done = run(strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", cal, "-v")
-    assert done.exit_code == 0, done.output
+    done = succeed("run", strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", cal, "-v")
     counts = report(tmp_path / "out")["counts"]
     angle = counts["no_data"]["incidence_angle"]
     # An echo of ten thousand is widened by more than four errors.
@@ -134,8 +128,7 @@ def write_trajectory(path):
 def test_a_trajectory_gives_the_same_as_the_vectors(tmp_path, plain, tiny_strip, calibration):
     path = write_trajectory(tmp_path / "t.csv")
     folder = tmp_path / "out"
-    done = run(tiny_strip, "-o", folder, "--profile", "fast", "--calibration", calibration, "--trajectory", path)
-    assert done.exit_code == 0, done.output
+    succeed("run", tiny_strip, "-o", folder, "--profile", "fast", "--calibration", calibration, "--trajectory", path)
     a, b = columns(folder, "cross_section")[0], columns(plain, "cross_section")[0]
     known = a != -9999
     np.testing.assert_array_equal(known, b != -9999)
@@ -149,8 +142,7 @@ def test_heights_of_another_kind_are_told(tmp_path, tiny_strip):
     raised = [f"{left},{float(height) + 45.0}" for left, _, height in (row.rpartition(",") for row in rows)]
     path.write_text("\n".join([head, *raised]))
     arguments = (tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--trajectory", path)
-    done = run(*arguments)
-    assert done.exit_code == 0, done.output
+    done = succeed("run", *arguments)
     (remark,) = report(tmp_path / "out")["remarks"]
     assert remark.startswith("range: by the trajectory echoes are 4") and "geoid" in remark and remark in done.stderr
     write_trajectory(path)  # under the same name
@@ -188,8 +180,7 @@ def test_resume_makes_it_anew_when_the_calibration_changes(tmp_path, tiny_strip)
     ],
 )
 def test_columns_that_are_not_written_have_a_reason_in_the_report(tmp_path, tiny_strip, arguments, expected):
-    done = run(tiny_strip, "-o", tmp_path / "out", "--profile", "fast", *arguments)
-    assert done.exit_code == 0, done.output
+    succeed("run", tiny_strip, "-o", tmp_path / "out", "--profile", "fast", *arguments)
     told = report(tmp_path / "out")["output"]
     for column, words in expected.items():
         assert column not in told["columns"] and words in told["not_computed"][column]
@@ -203,8 +194,7 @@ def test_relative_columns_are_written_on_request_and_say_so_in_the_file(tmp_path
               "attribute.incidence_angle_normals", "attribute.relative_reflectance",
               "attribute.cross_section")  # fmt: skip
     chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
-    done = run(tiny_strip, "-o", tmp_path / "out", "-c", chain, "--points", "returns")
-    assert done.exit_code == 0, done.output
+    succeed("run", tiny_strip, "-o", tmp_path / "out", "-c", chain, "--points", "returns")
     cloud = laspy.read(next((tmp_path / "out").glob("*.laz")))
     ranges, gamma, section = columns(tmp_path / "out", "range", "relative_backscatter", "relative_cross_section")
     known = gamma != -9999
@@ -229,8 +219,7 @@ def test_a_trajectory_that_does_not_cover_the_strip_is_told_with_counts(tmp_path
     lines = [",".join(map(repr, row)) for row in rows.tolist()]
     (tmp_path / "t.csv").write_text("\n".join(["time,x,y,z", *lines]))
     out = tmp_path / "out"
-    done = run(wide_strip, "-o", out, "--profile", "fast", "--trajectory", tmp_path / "t.csv")
-    assert done.exit_code == 0, done.output
+    done = succeed("run", wide_strip, "-o", out, "--profile", "fast", "--trajectory", tmp_path / "t.csv")
     lines = [line for line in done.stderr.splitlines() if "has no position" in line]
     (ranges,) = columns(out, "range")
     if not share:

@@ -6,6 +6,7 @@ import re
 
 import pytest
 from click.testing import CliRunner
+from commands import succeed
 from html_tools import Page
 
 import wavebatch as wb
@@ -28,15 +29,14 @@ def run(*arguments):
 
 
 def test_a_strip_with_itself_is_identical(strips):
-    result = run(strips / "a.las", strips / "a.las", "--min-completeness", 1, "--min-correctness", 1, "--max-rmse", 0)
-    assert result.exit_code == 0, result.output
+    limits = ("--min-completeness", 1, "--min-correctness", 1, "--max-rmse", 0)
+    result = succeed("compare", strips / "a.las", strips / "a.las", *limits)
     shown = result.stdout.splitlines()
     assert {"missed            0", "extra             0", "completeness      1.0000"} <= set(shown)
 
 
 def test_json_holds_every_figure_and_no_nan(strips):
-    result = run(strips / "a.las", "--truth", strips / "a.npz", "--json")
-    assert result.exit_code == 0
+    result = succeed("compare", strips / "a.las", "--truth", strips / "a.npz", "--json")
     assert "NaN" not in result.stdout
     figures = json.loads(result.stdout)
     assert figures["missed"] == figures["echoes_b"] - figures["matched"]
@@ -75,8 +75,7 @@ def test_a_figure_that_does_not_exist_meets_no_threshold(strips):
 def test_text_table_and_page_have_the_classes_and_the_numbers_of_echoes(strips, tmp_path):
     """Ground and plants of two simulated strips: the same figures everywhere."""
     files = ("-o", tmp_path / "t.csv", "--html", tmp_path / "p.html")
-    result = run(strips / "a.las", strips / "b.las", "--json", *files)
-    assert result.exit_code == 0, result.output
+    result = succeed("compare", strips / "a.las", strips / "b.las", "--json", *files)
     document = json.loads(result.stdout)
     text = run(strips / "a.las", strips / "b.las").stdout
     shown = Page(tmp_path / "p.html").check()

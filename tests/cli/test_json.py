@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 import pytest
-from commands import run_command
+from commands import succeed
 
 from wavebatch.cli import COMMANDS, main
 
@@ -60,8 +60,7 @@ def _hold(document, schema):
 
 
 def _print(*words):
-    result = run_command(*words, "--json")
-    assert result.exit_code == 0, result.output
+    result = succeed(*words, "--json")
     return json.loads(result.stdout)
 
 

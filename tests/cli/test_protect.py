@@ -5,7 +5,7 @@ import os
 import shutil
 
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.options import OutputPath
@@ -19,8 +19,7 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
     for name in ("s.las", "t.las"):
         simulate_strip("flat", folder / name, pulses=200, seed=1, options=StripOptions(internal=False))
-    made = run_command("survey", folder / "s.las", "-o", folder / "sys.toml", "--chain", folder / "chain.toml")
-    assert made.exit_code == 0
+    succeed("survey", folder / "s.las", "-o", folder / "sys.toml", "--chain", folder / "chain.toml")
     for name in ("list.txt", "list.csv"):
         (folder / name).write_text("s.las\n")
     (folder / "targets.csv").write_text("reflectance,x,y,radius\n0.5,0,0,5\n")
@@ -97,10 +96,8 @@ def test_an_input_is_never_replaced(place, words):
 
 def test_outputs_next_to_an_input_are_fine(place):
     for words in ("synthesize s.las -o s.laz", f"{_RUN} --report all.json", "synthesize s.las -o u.laz --external"):
-        result = run_command(*words.split(), catch_exceptions=False)
-        assert result.exit_code == 0, result.stderr
-    again = run_command("synthesize", "s.laz", "-o", "u.laz", "--external", "--overwrite")
-    assert again.exit_code == 0, again.stderr
+        succeed(*words.split(), catch_exceptions=False)
+    succeed("synthesize", "s.laz", "-o", "u.laz", "--external", "--overwrite")
 
 
 def test_every_option_that_writes_is_known_as_such():

@@ -10,7 +10,7 @@ import subprocess
 import sys
 
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from strips import cut_strip
 
 from wavebatch.cli import COMMANDS, main
@@ -103,8 +103,7 @@ def test_points_are_shown_where_the_packets_are_missing(place):
 def test_strips_without_points_pass_through_every_stage(place):
     empty = cut_strip(place / "strip.las", place / "empty.las", 0)
     columns = "+range,+incidence_angle_normals,+amplitude_normalized"
-    done = run_command("run", empty, "-o", "o", "--columns", columns)
-    assert done.exit_code == 0, done.stderr
+    succeed("run", empty, "-o", "o", "--columns", columns)
     quiet = run_command("run", empty, "-o", "q", "-q")
     assert "warning: the strip has no points, so its cloud has none" in quiet.stderr and quiet.exit_code == 0
     assert run_command("check", empty).stdout.endswith("ok (0 points, 0 packets)\n")

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 
 from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import Calibration
@@ -24,8 +24,7 @@ def strip(tmp_path_factory):
 
 
 def test_counts_go_to_stdout_and_talk_to_stderr(strip, tmp_path):
-    result = voxelize(strip, "--size", 1, "-o", tmp_path / "v.npz", "--json")
-    assert result.exit_code == 0, result.output
+    result = succeed("voxelize", strip, "--size", 1, "-o", tmp_path / "v.npz", "--json")
     counts = json.loads(result.stdout)
     with np.load(tmp_path / "v.npz") as file:
         assert counts["voxels"] == len(file["index"]) > 300
@@ -53,8 +52,7 @@ def test_every_method_and_option_changes_the_result(strip, tmp_path):
     ]  # fmt: skip
     made = set()
     for number, variant in enumerate(variants):
-        result = voxelize(strip, "--size", 1, "-o", tmp_path / f"{number}.npz", *variant)
-        assert result.exit_code == 0, result.output
+        succeed("voxelize", strip, "--size", 1, "-o", tmp_path / f"{number}.npz", *variant)
         with np.load(tmp_path / f"{number}.npz") as file:
             made.add(b"".join(file[name].tobytes() for name in ("index", "energy", "rays")))
     assert len(made) == len(variants)
@@ -63,8 +61,7 @@ def test_every_method_and_option_changes_the_result(strip, tmp_path):
 def test_calibrated_strips_have_cross_sections(strip, tmp_path):
     path = tmp_path / "CAL.toml"
     path.write_text(format_calibration(Calibration(2.5e-8, 0.03, 0.22, divergence=0.5)))
-    result = voxelize(strip, "--size", 2, "-o", tmp_path / "v.npz", "--calibration", path, "--json")
-    assert result.exit_code == 0, result.output
+    result = succeed("voxelize", strip, "--size", 2, "-o", tmp_path / "v.npz", "--calibration", path, "--json")
     assert json.loads(result.stdout)["sensor"] == "direction vectors"
     with np.load(tmp_path / "v.npz") as file:
         assert (file["cross_section"] > 0).all()

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from strips import add_record
 from writer_tools import data_file
 
@@ -223,8 +223,7 @@ def test_resume_sees_another_crs_of_the_same_corners(strip, tmp_path):
     said = []
     for crs in ("EPSG:32633", "urn:ogc:def:crs:EPSG::32633", "EPSG:23033", "EPSG:23033"):
         _write(file, _box(strip), crs)
-        result = run_command(*words, "--resume")
-        assert result.exit_code == 0, result.output
+        result = succeed(*words, "--resume")
         report = json.loads((tmp_path / "o" / "utm.report.json").read_text())
         said.append(("skipped" in result.stderr, report["request"]["selection"]["polygon"]["crs"]))
     assert said == [(False, "EPSG:32633"), (True, "EPSG:32633"), (False, "EPSG:23033"), (True, "EPSG:23033")]
@@ -237,8 +236,7 @@ def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
     own = _write(tmp_path / "own.geojson", box)
     numbers, counted = [], []
     for name, file in (("a", degrees), ("b", own)):
-        result = run_command("run", strip, "-o", tmp_path / name, "--polygon", file, "-q")
-        assert result.exit_code == 0, result.output
+        result = succeed("run", strip, "-o", tmp_path / name, "--polygon", file, "-q")
         numbers.append(read_header(tmp_path / name / "utm.laz").point_count)
         result = run_command("stats", strip, "--polygon", file, "--json")
         counted.append([area["points"] for area in json.loads(result.stdout)["files"][0]["areas"]])

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command
+from commands import run_command, succeed
 from hypothesis import given
 from hypothesis import strategies as st
 from strips import add_record, descriptor, make_raw, vlr
@@ -447,8 +447,7 @@ def test_so_do_rasters_and_voxels(strip, tmp_path):
     rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     for words in (["grid", strip, "--statistic", "count", "--size", 5, "-o", tmp_path / "x.tif"],
                   ["voxelize", strip, "--size", 5, "-o", tmp_path / "v.las"]):  # fmt: skip
-        result = run_command(*words)
-        assert result.exit_code == 0, result.output
+        succeed(*words)
     with rasterio.open(tmp_path / "x.tif") as raster:
         assert raster.crs.is_projected and _longitude(raster.crs) == pytest.approx(15.6567, abs=1e-3)
     voxels = tmp_path / "v.las"
@@ -526,8 +525,7 @@ def test_errors_along_the_ray_are_metres_in_any_unit(scale):
 
 def test_so_do_synthetic_strips(strip, tmp_path):
     words = ["synthesize", strip, "-o", tmp_path / "s.las"]
-    result = run_command(*words)
-    assert result.exit_code == 0, result.output
+    succeed(*words)
     definition = read_crs_definition(tmp_path / "s.las", read_header(tmp_path / "s.las"))
     assert definition == repair_wkt(RIPROCESS)
     records = [vlr.payload for vlr in read_header(tmp_path / "s.las").vlrs if vlr.record_id == WKT_ID]

@@ -13,7 +13,7 @@ import laspy
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command
+from commands import run_command, succeed
 from strips import descriptor, make_raw, read_all
 
 from wavebatch.core.echoes import EchoFlag
@@ -279,8 +279,7 @@ def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     for options in ([], ["--sheet"]):
         target = tmp_path / f"a{len(options)}.png"
         arguments = ["plot", "waveform", str(strip), "--random", "2", "-o", str(target), *options]
-        result = run_command(*arguments)
-        assert result.exit_code == 0, result.output
+        succeed(*arguments)
     text = run_command("info", strip).stdout
     assert "with fill between recordings" in text
 
@@ -330,8 +329,7 @@ def test_padded_strips_lose_nothing_of_what_was_recorded(tmp_path, kind):
     simulate_strip("mixed", whole, pulses=3000, seed=11, options=StripOptions(point_format=4))
     rng = np.random.default_rng(12)
     ends = pad(whole, padded, lambda n: np.full(n, 64) if kind == "one length" else rng.integers(50, 81, n))
-    result = run_command("run", padded, "-o", tmp_path, "--points", "returns", "-q")
-    assert result.exit_code == 0, result.output
+    succeed("run", padded, "-o", tmp_path, "--points", "returns", "-q")
     report = json.loads((tmp_path / "padded.report.json").read_text("utf-8"))
     recorded = laspy.read(padded).return_point_wave_location / 1000 < ends - 8
     found = (laspy.read(tmp_path / "padded.laz").echo_flags & int(EchoFlag.NO_ECHO)) == 0

@@ -4,11 +4,7 @@ import naive_geometry
 import numpy as np
 
 from wavebatch.kernels.geometry import normals
-from wavebatch.kernels.geometry.group_returns import (
-    LONGEST_PULSE,
-    find_rays,
-    group_times,
-)
+from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, find_rays, group_times
 from wavebatch.kernels.geometry.normals import thin_out
 
 

@@ -6,12 +6,7 @@ import pytest
 from published import PULSE_SIGMA
 
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.pulse_shape import (
-    PulseShape,
-    evaluate_pulse,
-    fit_one_gaussian,
-    tabulate_pulse,
-)
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse, fit_one_gaussian, tabulate_pulse
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import ShapeLimits, model_parameters

@@ -4,16 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from contract_tools import (
-    SYSTEMS,
-    assert_same,
-    check_echoes,
-    inputs,
-    make_block,
-    pieces,
-    scene_blocks,
-    waveforms,
-)
+from contract_tools import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
 
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable

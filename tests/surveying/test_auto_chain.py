@@ -12,13 +12,7 @@ import wavebatch
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import load_profile, parse_chain
 from wavebatch.surveying import Decision, Survey, survey_block
-from wavebatch.surveying.choose_chain import (
-    LOST,
-    chain_text,
-    choose_chain,
-    decide,
-    widest_chain,
-)
+from wavebatch.surveying.choose_chain import LOST, chain_text, choose_chain, decide, widest_chain
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 from wavebatch.tools.simulate.render import PulseModel

@@ -6,6 +6,7 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command as call
+from commands import succeed
 
 import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
@@ -47,8 +48,7 @@ def flight(tmp_path_factory):
     strips = [folder / f"{name}.las" for name in sensors]
     options = ("--targets", folder / "t.csv", "-o", folder / "cal.toml", "--divergence", 0.5)
     outputs = ("--report", folder / "cal.json", "--html", folder / "cal.html")
-    done = call("calibrate", *strips, *options, *outputs)
-    assert done.exit_code == 0, done.output
+    done = succeed("calibrate", *strips, *options, *outputs)
     return folder, done.stderr
 
 
@@ -210,8 +210,7 @@ def clouds(flight, tmp_path_factory):
     # Without the rows of the strips both get the mean constant of the channel, and their drifts show.
     (out / "mean.toml").write_text(text[: text.index("[[flight_strip]]")])
     for name, cal in (("own", folder / "cal.toml"), ("mean", out / "mean.toml")):
-        done = call("run", folder / "a.las", folder / "b.las", "-o", out / name, "--calibration", cal)
-        assert done.exit_code == 0, done.output
+        succeed("run", folder / "a.las", folder / "b.las", "-o", out / name, "--calibration", cal)
     return out
 
 

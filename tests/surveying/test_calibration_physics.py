@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from commands import run_command as call
+from commands import succeed
 
 import wavebatch as wb
 from tests.facet_strips import AIR, EAST, NORTH, START, Facet, Sensor, box, write_strip, write_trajectory
@@ -57,8 +58,7 @@ def test_a_strip_calibrates_and_runs_with_one_pulse_and_one_chain(tmp_path, puls
     strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(pulse=pulse), 6000)
     targets = write_targets(tmp_path / "t.csv", (0.3, 40, -15, 70, 15))
     cal = tmp_path / "cal.toml"
-    done = call("calibrate", strip, "--targets", targets, "-o", cal, "--divergence", 0.5)
-    assert done.exit_code == 0, done.output
+    done = succeed("calibrate", strip, "--targets", targets, "-o", cal, "--divergence", 0.5)
     found = load_calibration(cal)
     cloud = wb.read_cloud(strip)
     inside = (np.abs(cloud["x"] - EAST - 55) < 14.7) & (np.abs(cloud["y"] - NORTH) < 14.7)
@@ -184,8 +184,7 @@ def channels(tmp_path_factory):
     sensor = Sensor(gains={1: 1.0, 2: 0.45})
     strip = write_strip(folder / "two.las", [Facet(0.3)], sensor, 6000)
     targets = write_targets(folder / "t.csv", (0.3, 40, -15, 70, 15))
-    done = call("calibrate", strip, "--targets", targets, "-o", folder / "two.toml", "--divergence", 0.5)
-    assert done.exit_code == 0, done.output
+    succeed("calibrate", strip, "--targets", targets, "-o", folder / "two.toml", "--divergence", 0.5)
     return folder
 
 
@@ -349,8 +348,7 @@ def test_a_trajectory_that_is_too_low_is_named_and_in_the_error(tmp_path):
     path = write_trajectory(tmp_path / "path.csv", sensor, 1.0, lower=48.0)
     targets = write_targets(tmp_path / "t.csv", (0.3, 30, -15, 60, 15))
     cal = tmp_path / "cal.toml"
-    done = call("calibrate", strip, "--targets", targets, "-o", cal, "--trajectory", path)
-    assert done.exit_code == 0
+    done = succeed("calibrate", strip, "--targets", targets, "-o", cal, "--trajectory", path)
     assert "warning: range: by the trajectory echoes are 47." in done.stderr and "nearer" in done.stderr
     found = load_calibration(cal)
     off = found.constant / constant_of(sensor) - 1
@@ -369,8 +367,7 @@ def test_a_vendors_column_of_reflectances_is_an_anchor(tmp_path, vendor):
     sensor = Sensor(vendor=vendor, divergence=0.3e-3)
     ground = [Facet(0.15, inside=box(0, -300, 60, 300)), Facet(0.5, slope=(0.3, 0.0), z0=-9.0, centre=(30.0, 0.0))]
     strip = write_strip(tmp_path / "s.las", ground, sensor, 12_000)
-    done = call("calibrate", strip, "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
-    assert done.exit_code == 0, done.output
+    done = succeed("calibrate", strip, "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
     row = load_calibration(tmp_path / "cal.toml").channels[0]
     assert row.constant == pytest.approx(constant_of(sensor), rel=0.01)
     # Ranges of 700 to 730 m do not show whether the column holds the air, which takes 7 %.

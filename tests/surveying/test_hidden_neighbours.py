@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
 from wavebatch.core.waveforms import SystemPulse
@@ -70,8 +70,7 @@ def test_a_survey_of_an_earlier_version_is_named(tmp_path):
     said = {}
     for name, text in {"new": system.read_text(), "old": re.sub("(?m)^hidden_.*\n", "", system.read_text())}.items():
         (tmp_path / f"{name}.toml").write_text(text)
-        done = run_command("run", strip, "-o", tmp_path / name, "--system", tmp_path / f"{name}.toml")
-        assert done.exit_code == 0
+        succeed("run", strip, "-o", tmp_path / name, "--system", tmp_path / f"{name}.toml")
         remarks = json.loads((tmp_path / name / "f.report.json").read_text())["remarks"]
         said[name] = [line for line in remarks if "an earlier version made this file" in line]
     assert not said["new"] and "without hidden_light and hidden_width" in said["old"][0]

@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from commands import run_command as run
 from helpers_scenes import make_scene
 from writer_tools import data_file
@@ -40,8 +40,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("saved")
     for name, scene in SCENES.items():
         simulate_strip(scene, folder / f"{name}.las", pulses=1500, seed=5)
-    result = run_command("survey", folder / "flat.las", "-o", folder / "SYSTEM.toml")
-    assert result.exit_code == 0, result.output
+    succeed("survey", folder / "flat.las", "-o", folder / "SYSTEM.toml")
     return folder
 
 
@@ -118,8 +117,7 @@ def test_every_command_refuses_and_obeys_force(folder, tmp_path, monkeypatch, co
 
 
 def test_a_forced_survey_is_a_warning_and_in_the_report(folder, tmp_path):
-    result = run("run", folder / "noisy.las", "-o", tmp_path, "-q", "--system", folder / "SYSTEM.toml", "--force")
-    assert result.exit_code == 0
+    result = succeed("run", folder / "noisy.las", "-o", tmp_path, "-q", "--system", folder / "SYSTEM.toml", "--force")
     assert "warning: --force: the survey given by --system is not of this sensor: its noise is" in result.stderr
     assert "--force: the survey" in (tmp_path / "noisy.report.json").read_text()
 

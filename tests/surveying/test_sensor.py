@@ -16,14 +16,7 @@ from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.reader import MOST_SLICES, RAYS_PER_SLICE, RaySample, StripReader, sample_rays
 from wavebatch.kernels.physics.radiometry import mean_haze
-from wavebatch.surveying.sensor import (
-    UNKNOWN,
-    SensorRequest,
-    SensorSource,
-    estimate_path,
-    find_sensor,
-    find_turn,
-)
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, estimate_path, find_sensor, find_turn
 from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
 

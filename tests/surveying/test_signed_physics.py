@@ -8,18 +8,13 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command
+from commands import succeed as call
 from footprints import Flight, Plane, match, roofs, write_strip
 
 from wavebatch.surveying.systems.survey_result import load_survey
 
 GREEN = Flight()
 HILLSIDE = Plane(slope=(np.tan(np.radians(22.0)), 0.1))
-
-
-def call(*arguments):
-    done = run_command(*arguments)
-    assert done.exit_code == 0, done.output
-    return done
 
 
 def write_calibration(path, flight, *, divergence=None, shot_energy=0.0):

@@ -7,6 +7,7 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command as call
+from commands import succeed
 
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.files.strip.reader import StripReader
@@ -87,15 +88,13 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     x, y = float(np.median(cloud.x)), float(np.median(cloud.y))
     targets, cal, folder = tmp_path / "t.csv", tmp_path / "cal.toml", tmp_path / "out"
     targets.write_text(f"name,reflectance,x,y,radius\nnear,0.2,{x},{y},40\nnowhere,0.5,{x + 1e5},{y},40\n")
-    done = call("calibrate", ground, "--targets", targets, "-o", cal, "--divergence", 0.5)
-    assert done.exit_code == 0, done.output
+    done = succeed("calibrate", ground, "--targets", targets, "-o", cal, "--divergence", 0.5)
     (row,) = [line for line in done.stderr.splitlines() if line.startswith("  nowhere ")]
     assert row.split()[1] == "0.5" and "  0 clean single echoes" in row and "warning" not in done.stderr
     found = load_calibration(cal)
     assert found.divergence == 0.5 and 0.03 <= found.relative_error < 0.1
     assert found.strip == "flat.las" and "direction vectors" in found.conditions
-    done = call("run", ground, "-o", folder, "--profile", "balanced", "--calibration", cal)
-    assert done.exit_code == 0, done.output
+    done = succeed("run", ground, "-o", folder, "--profile", "balanced", "--calibration", cal)
     cloud = laspy.read(next(folder.glob("*.laz")))
     inside = np.hypot(cloud.x - x, cloud.y - y) < 40
     rho = np.asarray(cloud["reflectance"])[inside]
@@ -138,8 +137,7 @@ def test_a_lever_arm_leads_from_the_trajectory_to_the_scanner(tmp_path, ground):
     for number, options in enumerate([(), ("--trajectory", tmp_path / "t.csv"), ("--lever-arm", "2,0,30")]):
         cal = tmp_path / f"{number}.toml"
         options = ("--trajectory", tmp_path / "t.csv", *options) if number == 2 else options
-        done = call("calibrate", ground, "--targets", tmp_path / "g.csv", "-o", cal, *options)
-        assert done.exit_code == 0, done.output
+        succeed("calibrate", ground, "--targets", tmp_path / "g.csv", "-o", cal, *options)
         constants.append(load_calibration(cal).constant)
     vectors, antenna, scanner = constants
     assert scanner == pytest.approx(vectors, rel=1e-4)
@@ -190,8 +188,7 @@ def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_chan
     targets, cal, folder = tmp_path / "t.csv", tmp_path / "cal.toml", tmp_path / "out"
     ground = f"{GROUND_REFLECTS},{x - 60} {y + 0.2} {x + 60} {y + 0.2} {x + 60} {y + 5.8} {x - 60} {y + 5.8}"
     targets.write_text(f"reflectance,vertices\n{ground}\n")
-    done = call("calibrate", two_channels, "--targets", targets, "-o", cal)
-    assert done.exit_code == 0, done.output
+    done = succeed("calibrate", two_channels, "--targets", targets, "-o", cal)
     assert "digitizer 1, scanner channel 0 " in done.stderr and "digitizer 2, scanner" in done.stderr
     found = load_calibration(cal)
     strong, weak = found.channels

@@ -6,7 +6,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from commands import run_command
+from commands import succeed as call
 from helpers_scenes import make_scene
 
 from wavebatch.core.waveforms import Radiometry, SystemPulse
@@ -34,12 +34,6 @@ def test_the_radius_of_neighbourhoods_holds_enough_points(tmp_path):
     apart = np.sort(np.linalg.norm(xyz[:, None] - xyz, axis=2), axis=1)[:, LEAST_NEIGHBOURS * 3 // 2 - 1]
     with StripReader(tmp_path / "v.las") as reader, reader.scan() as scan:
         assert choose_radius(reader, scan) == pytest.approx(np.ceil(10 * np.quantile(apart, 0.9)) / 10)
-
-
-def call(*arguments):
-    done = run_command(*arguments)
-    assert done.exit_code == 0, done.output
-    return done
 
 
 def write_targets(path, strip):

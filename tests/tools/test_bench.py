@@ -23,7 +23,7 @@ from bench.promises import judge
 from bench.release import format_release, measure_cases
 from bench.stability import FAILURES
 from bench_tools import time_here
-from commands import run_command
+from commands import succeed
 
 import wavebatch
 from wavebatch.batch.workers.futures import WorkerDied
@@ -36,14 +36,7 @@ from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import accuracy, command
 from wavebatch.tools.sheets.sheet import list_lines
-from wavebatch.tools.simulate import (
-    PULSES,
-    Recording,
-    find_scene,
-    simulate_block,
-    simulate_blocks,
-    simulate_strip,
-)
+from wavebatch.tools.simulate import PULSES, Recording, find_scene, simulate_block, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.render import paint_echoes
 from wavebatch.tools.simulate.scenes import Scene
 
@@ -151,8 +144,7 @@ def test_command_writes_what_it_prints(tmp_path, monkeypatch):
     chain.write_text(
         "".join(f'[[chain]]\nstage = "{s}"\n' for s in ("noise.pooled", "detect.maximum", "decompose.none"))
     )
-    result = run_command("bench", chain, "-o", tmp_path / "out", *options.split())
-    assert result.exit_code == 0, result.output
+    result = succeed("bench", chain, "-o", tmp_path / "out", *options.split())
     document = json.loads((tmp_path / "out" / "bench.json").read_text())
     assert json.loads(result.stdout) == document
     mine = find_row(document, "mine")
@@ -444,8 +436,7 @@ def test_every_method_has_a_chain():
 @pytest.mark.slow
 def test_all_methods_stand_in_one_table(timed_here):
     options = "--scene flat --waveforms 600 --pulses 0 --repeat 1 --all-methods --json"
-    result = run_command("bench", *options.split())
-    assert result.exit_code == 0, result.output
+    result = succeed("bench", *options.split())
     rows = {row["name"]: row for row in json.loads(result.stdout)["scenes"][0]["rows"]}
     assert set(command.list_methods()) | {"fast", "balanced", "accurate"} <= set(rows)
     for name in ("detect.maximum", "detect.asdf", "decompose.gaussian", "decompose.reference"):

@@ -18,13 +18,7 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.decompose.models import fitted_pulse, rebuild_waveforms
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.tools.compare_chains import (
-    Contender,
-    FitQuality,
-    find_contender,
-    match_sides,
-    measure_fit,
-)
+from wavebatch.tools.compare_chains import Contender, FitQuality, find_contender, match_sides, measure_fit
 
 
 def make_chain(detector, decomposer, **parameters):

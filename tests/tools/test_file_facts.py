@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import laspy
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from writer_tools import data_file, write_source
 
 import wavebatch as wb
@@ -94,8 +94,7 @@ def test_the_command_is_what_was_typed_without_folders():
 
 def _make(words, folder):
     """The report of a run."""
-    done = run_command(*words, "-o", folder)
-    assert done.exit_code == 0, done.stderr
+    succeed(*words, "-o", folder)
     return json.loads(Path(folder, "a strip.report.json").read_text())
 
 
@@ -107,8 +106,7 @@ def test_headers_that_are_wrong_show():
 @pytest.mark.parametrize("account", [b"[]", b"{", b'{"options": 3, "request": [], "columns": 7, "chain": {}}'])
 def test_accounts_of_any_form_are_shown_as_far_as_they_go(tmp_path, account):
     write_source(tmp_path / "a.las", 6, (1, 4), vlrs=[Vlr(b"wavebatch", 1, account)])
-    result = run_command("info", tmp_path / "a.las")
-    assert result.exit_code == 0, result.output
+    succeed("info", tmp_path / "a.las")
 
 
 def test_times_that_are_no_seconds_of_the_week_are_not_called_so():

@@ -5,7 +5,7 @@ import json
 import laspy
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from forest_scenes import fly, grow
 
 from wavebatch.core.errors import ConfigError
@@ -181,8 +181,7 @@ def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
     made = ["voxelize", *strips, "--size", 1, "--forest", "--system", tmp_path / "system.toml", "--force", "-o",
             tmp_path / "v"]  # fmt: skip
     for words in (made, ["grid", tmp_path / "v", "--forest", "--size", CELL, "-o", tmp_path / "f.tif"]):
-        result = run_command(*words)
-        assert result.exit_code == 0, result.output
+        succeed(*words)
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["a.laz", "b.laz"]
     both = [tmp_path / "v" / f"{name}.laz" for name in "ab"]
     _, found = measure(both, tmp_path)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from batch_tools import read_cloud, run_one
 from click.testing import CliRunner
+from commands import succeed
 
 from wavebatch.cli.strips import synthesize
 from wavebatch.core.errors import InputError
@@ -139,8 +140,7 @@ def test_command_line(cloud, tmp_path):
     strong = run(cloud, "-o", target, "--overwrite", "--gain", "10")
     assert strong.exit_code == 0 and "above the digitizer" in strong.stderr
     figures = ("--intensity", "reflectance", "--sensor-height", "920", "--divergence", "0.7")
-    radar = run(cloud, "-o", tmp_path / "r.las", *figures)
-    assert radar.exit_code == 0, radar.output
+    succeed("synthesize", cloud, "-o", tmp_path / "r.las", *figures)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r.las", "s.las"]
 
 
@@ -239,8 +239,7 @@ def test_a_wide_echo_is_lower_and_has_the_same_energy(cloud, tmp_path):
 def test_energy_that_is_not_of_echoes_is_shown(cloud, tmp_path, baseline, noise, level):
     """Noise that is cut off at 0, or a fraction of a count, moves every sample without an echo."""
     words = ("--baseline", baseline, "--noise", noise, "--gain", 0.01, "--bits", 16)
-    result = run(cloud, "-o", tmp_path / "s.las", *words, "--json")
-    assert result.exit_code == 0, result.output
+    result = succeed("synthesize", cloud, "-o", tmp_path / "s.las", *words, "--json")
     document = json.loads(result.stdout)
     samples = np.concatenate([block.samples[:, :4].ravel() for block in read_blocks(tmp_path / "s.las")])
     error = 5 * max(samples.std(), 1e-6) / np.sqrt(samples.size)

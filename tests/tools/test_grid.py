@@ -7,7 +7,7 @@ import laspy
 import numpy as np
 import pytest
 import rasterio
-from commands import run_command
+from commands import run_command, succeed
 from writer_tools import write_points
 
 from wavebatch.files.las.crs import read_crs_definition
@@ -214,8 +214,7 @@ def test_counts_of_two_digitizers_in_one_raster_are_named(tmp_path):
 
     def grid(column, *names):
         clouds = [tmp_path / "out" / f"{name}.laz" for name in names]
-        done = run_command("grid", *clouds, "--column", column, "-o", tmp_path / "x.tif", "--size", 5, "--overwrite")
-        assert done.exit_code == 0, done.output
+        done = succeed("grid", *clouds, "--column", column, "-o", tmp_path / "x.tif", "--size", 5, "--overwrite")
         return " ".join(done.stderr.split())
 
     said = grid("amplitude", "a", "b")
@@ -235,7 +234,6 @@ def test_counts_of_two_digitizers_are_named(rng, tmp_path, first, named):
     words = f"warning: high: counts of {tmp_path / 'a.las'} (8 bits, 1 ns apart) and {tmp_path / 'b.las'} (12 bits"
     assert (words in result.stderr) == named and ("do not compare" in result.stderr) == named
     for kind, more in (("histogram", ()), ("map", ("--size", 5)), ("histogram", ("--each",))):
-        picture = run_command("plot", kind, tmp_path / "a.las", tmp_path / "b.las", "--column", "high", *more,
-                              "-o", tmp_path / "x.svg", "--overwrite")  # fmt: skip
-        assert picture.exit_code == 0
+        picture = succeed("plot", kind, tmp_path / "a.las", tmp_path / "b.las", "--column", "high", *more,
+                          "-o", tmp_path / "x.svg", "--overwrite")  # fmt: skip
         assert (words in picture.stderr) == (named and more != ("--each",)), kind

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from pulse_files import Pulse, PulseFile, Sampling, bell
 
 import wavebatch as wb
@@ -120,8 +120,7 @@ def _sent(rng, number, height, noise, top=255):
 
 
 def _run(tmp_path, *options):
-    done = run_command("run", tmp_path / "o.las", "-o", tmp_path / "out", *options)
-    assert done.exit_code == 0, done.output
+    done = succeed("run", tmp_path / "o.las", "-o", tmp_path / "out", *options)
     return wb.read_cloud(tmp_path / "out" / "o.laz"), done.output
 
 

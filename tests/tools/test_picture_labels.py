@@ -6,7 +6,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from plot_tools import PULSE, make_chain, simulate, write_cloud
 
 from wavebatch.files import figure_file
@@ -114,8 +114,7 @@ def test_maps_of_any_shape(texts, tmp_path, shape):
 def test_slices_and_cubes(texts, tmp_path, riegl):
     words = ["slice", riegl, "--lines", "0:6", "--shortest", "10", "--png", tmp_path / "a.png"]
     words += ["--overview", tmp_path / "b.png", "--cube", tmp_path / "c.npz"]
-    result = run_command(*words)
-    assert result.exit_code == 0, result.output
+    succeed(*words)
     assert run_plot("cube", tmp_path / "c.npz", "-o", tmp_path / "c.png").exit_code == 0
     check(texts)
     assert any(riegl.name in text for name, text, *_ in texts if name == "picture 1"), "the strip is named"

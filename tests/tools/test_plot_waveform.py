@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from plot_tools import PULSE, make_chain, simulate
 from scipy.optimize import curve_fit
 from strips import make_raw
@@ -200,8 +200,7 @@ def test_strips_without_waveforms(tmp_path, riegl, data):
 @pytest.mark.parametrize("samples", [1, 2, 8])
 def test_short_waveforms_can_be_drawn(tmp_path, samples):
     strip = make_raw(5, n_samples=samples).write(tmp_path / "short.las")
-    result = run(strip, "-o", tmp_path / "p.png", "--packet", 2, "--profile", "fast")
-    assert result.exit_code == 0, result.output
+    succeed("plot", "waveform", strip, "-o", tmp_path / "p.png", "--packet", 2, "--profile", "fast")
 
 
 def test_pictures_say_what_they_show_with_the_same_bytes_each_time(tiny_strip, tmp_path):
@@ -231,8 +230,7 @@ def test_a_chain_that_fits_nothing_is_drawn_without_a_fit(tiny_strip, tmp_path):
     stages = ("noise.pooled", "detect.maximum", "decompose.none", "attribute.amplitude", "attribute.position")
     chain.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
     parse_chain(chain.read_text(), "none")
-    result = run(tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--chain", chain)
-    assert result.exit_code == 0, result.output
+    succeed("plot", "waveform", tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--chain", chain)
     assert "this chain fits no pulse" in (tmp_path / "p.svg").read_text("utf-8")
 
 

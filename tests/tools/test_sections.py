@@ -8,6 +8,7 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command as run
+from commands import succeed
 from plot_tools import write_cloud
 from writer_tools import write_points
 
@@ -240,8 +241,7 @@ def test_segments_are_found_as_clouds_are(tmp_path, monkeypatch, given):
         for name in ("s.csv", "t.csv" if folder.name == "segs" else "s2.csv"):
             _write_segments(folder / name, [(1, 2), (3, 4)], [1, 2])
     (tmp_path / "list.txt").write_text("s*.csv\n")
-    result = run("plot", "profile", *given.split(), "-o", "p.png", "--json", "-q")
-    assert result.exit_code == 0, result.output
+    result = succeed("plot", "profile", *given.split(), "-o", "p.png", "--json", "-q")
     document = json.loads(result.stdout)
     assert len(document["clouds"]) == 2 and document["values"] == 4
 

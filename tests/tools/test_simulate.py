@@ -9,15 +9,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.physics.radiometry import backscatter
-from wavebatch.tools.simulate import (
-    SCENES,
-    PulseModel,
-    Recording,
-    find_pulse,
-    find_scene,
-    render,
-    shape_pulse,
-)
+from wavebatch.tools.simulate import SCENES, PulseModel, Recording, find_pulse, find_scene, render, shape_pulse
 from wavebatch.tools.simulate.scenes import HAZARDS, SEED_BLOCK, flag_truth, simulate_blocks
 
 ALL = [*SCENES, *(f"stiff.{name}" for name in HAZARDS)]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from commands import run_command
+from commands import run_command, succeed
 from strips import cut_strip
 
 from wavebatch.cli.geometry import slice_
@@ -155,8 +155,7 @@ def run(*arguments):
 
 
 def test_csv_and_geojson_hold_the_same_segments(strip, tmp_path):
-    result = run(strip, "-o", tmp_path / "s.csv", "--lines", "1:3", "--json")
-    assert result.exit_code == 0, result.output
+    result = succeed("slice", strip, "-o", tmp_path / "s.csv", "--lines", "1:3", "--json")
     counts = json.loads(result.stdout)
     assert counts["lines"] == 2 and 1.7 < counts["sigma"] < 2.6
     rows = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
@@ -187,8 +186,7 @@ def test_a_shuffled_strip_says_what_to_do(tiny_strip, tmp_path, edit_points, rng
 
 
 def test_real_strip(riegl, tmp_path):
-    result = run(riegl, "-o", tmp_path / "s.csv", "--json")
-    assert result.exit_code == 0, result.output
+    result = succeed("slice", riegl, "-o", tmp_path / "s.csv", "--json")
     counts = json.loads(result.stdout)
     assert counts["lines"] > 50 and counts["segments"] > 50
 

@@ -6,7 +6,7 @@ import shutil
 import struct
 
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from strips import add_record
 
 from wavebatch.core.errors import ConfigError
@@ -26,8 +26,7 @@ DEGREES = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],
 def clouds(tiny_strip, tmp_path_factory):
     """The same cloud in metres, in feet (the same places), and with a CRS in degrees."""
     folder = tmp_path_factory.mktemp("units")
-    result = run_command("run", tiny_strip, "-o", folder, "--profile", "balanced", "--format", "las", "-q")  # fmt: skip
-    assert result.exit_code == 0, result.output
+    succeed("run", tiny_strip, "-o", folder, "--profile", "balanced", "--format", "las", "-q")  # fmt: skip
     metres = folder / tiny_strip.name
     found = {"m": metres}
     for name, wkt, factor in (("ft", FEET, 1 / FOOT), ("deg", DEGREES, 1.0)):

@@ -6,7 +6,7 @@ import laspy
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command
+from commands import run_command, succeed
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnReader
@@ -106,8 +106,7 @@ def test_grids_are_of_them(cloud, split, tmp_path):
     path, number, total = split
     for source, name, more in ((cloud, "some", ["--where", TEXT]), (path, "same", [])):
         words = ["grid", source, "--column", "amplitude", "--size", 3, "-o", tmp_path / f"{name}.tif", "--json", *more]
-        result = run_command(*words)
-        assert result.exit_code == 0, result.output
+        result = succeed(*words)
         found = json.loads(result.stdout)
         assert found["points"] - found["left_out"] == number and found["left_out"] == (total - number) * bool(more)
     with rasterio.open(tmp_path / "some.tif") as some, rasterio.open(tmp_path / "same.tif") as same:
