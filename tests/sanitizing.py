@@ -210,12 +210,13 @@ def judge(samples: Samples, echoes: Candidates, rng: np.random.Generator) -> Non
         table = EchoTable.build(*columns, **values, flags=rng.choice([0, 16], m))
     width, level = 10 ** rng.uniform(-3, 3, 2)
     curve = tuple(zip(np.sort(rng.normal(0, 9, rng.integers(0, 4))), rng.random(3), strict=False))
-    assert len(neighbours.find_faint(table, Faintness(0.1, 0, 9, True, level, 0.1, curve, 1, 5, 9, 2, 2, 2))) == m
     law = Unexplained(5.0, 0.1, level, 9.0, 1.0, curve, 1.0, 1.0, level, 0.1, width, 1.0)
     assert (neighbours.weigh_fits(table, law, others=True)[0] >= 1).all()
     flagging = Flagging(0.5, 0.5 * s, width, width, level, 1.5, 0.1)
-    assert len(neighbours.set_flags(table, samples._replace(baseline=samples.std), flagging)) == m
-    assert len(neighbours.find_pairs(table, width, rng.choice([0.0, 1.0]))) <= m
+    faint = Faintness(0.1, 0, 9, True, level, 0.1, curve, 1, 5, 9, 2, 2, 2)
+    steps = neighbours.Finishing(0.5, width, width, rng.choice([0.0, 1.0]), faint, law, True, True, flagging, faint)
+    levels = samples._replace(baseline=samples.std)
+    assert len(neighbours.finish_echoes(table.columns(), np.arange(m), levels, steps, np.ones((m, 4)))[1]) <= m
 
 
 def damage_strips(folder: Path, cases: int, seed: int) -> list[str]:

@@ -11,8 +11,10 @@ from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import crlb
+from wavebatch.kernels.fit.neighbours import Finishing, finish_echoes
+from wavebatch.kernels.library import Samples
 from wavebatch.stages.chain import STAGES, load_profile
-from wavebatch.stages.decompose.merge import merge_unresolved
+from wavebatch.stages.decompose.merge import OVERLAP, UNRESOLVED
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block
 
 STD = float(np.hypot(1, 1 / np.sqrt(12)))
@@ -240,7 +242,10 @@ def test_echoes_that_cannot_be_told_apart_are_merged_and_others_are_not():
         sigma_err=np.ones(8),
         flags=np.array([16, 16, 16, 16, 0, 0, 16, 16]),
     )
-    merged = merge_unresolved(table)
+    samples = Samples(np.zeros((4, 60), np.uint8), *np.ones((2, 4), np.float32))
+    steps = Finishing(overlap=OVERLAP, unresolved=UNRESOLVED)
+    columns = {name: values.copy() for name, values in table.columns().items()}
+    merged = EchoTable(**finish_echoes(columns, np.arange(8), samples, steps)[0])
     assert merged.count(4).tolist() == [1, 2, 2, 2]
     assert merged.time[0] == pytest.approx(30.3)
     assert merged.amplitude[0] * merged.sigma[0] == pytest.approx(80 * SIGMA, rel=1e-5)

@@ -8,8 +8,10 @@ import pytest
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
-from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
-from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, find_unexplained, flag_echoes
+from wavebatch.kernels.fit.neighbours import Finishing, finish_echoes
+from wavebatch.kernels.library import Samples
+from wavebatch.stages.decompose.merge import OVERLAP, TWINS, UNRESOLVED
+from wavebatch.stages.flags import find_unexplained, flag_echoes, leave_beside, misfit_factor, unexplained, unproven
 from wavebatch.stages.pulse_tables import floor_level
 
 OVERLAPPED = int(EchoFlag.OVERLAPPED)
@@ -31,6 +33,19 @@ def table(rng):
         time_err=rng.uniform(0.05, 6, m), amplitude_err=rng.uniform(0.5, 4, m), sigma_err=rng.uniform(0.05, 0.4, m),
         relative_energy_err=rng.uniform(0.01, 0.1, m), flags=rng.choice([0, OVERLAPPED], m, p=[0.3, 0.7]),
     )  # fmt: skip
+
+
+def finish(table, factors=None, missing=None, **steps):
+    """The table after some of the steps, with the rows that are left and how errors grew."""
+    columns, ones = {name: values.copy() for name, values in table.columns().items()}, np.ones(N, np.float32)
+    samples = Samples(np.zeros((N, S), np.uint8), ones, ones, missing)
+    columns, row, grown = finish_echoes(columns, np.arange(len(table)), samples, Finishing(**steps), factors)
+    return EchoTable(**columns), row, grown
+
+
+def cover(table, system):
+    steps = {"unexplained": unexplained(system, 0.5), "others": leave_beside(system)}
+    return finish(table, **steps)[0]
 
 
 def pairs(table):
@@ -112,7 +127,7 @@ def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(tab
                 least = max(least, 1.5 * tail, tail + 2 * table.amplitude_err[i])
             if table.amplitude[i] < least:
                 dropped.add(i)
-        kept = drop_unproven(table, system, top)
+        kept = finish(table, unproven=unproven(system, top))[0]
         left = [i for i in range(len(table)) if i not in dropped]
         np.testing.assert_array_equal(kept.time, table.time[left])
         assert 10 < len(dropped) < len(table) // 2
@@ -123,7 +138,8 @@ def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(tab
 )
 def test_what_is_left_beside_echoes_is_in_the_errors_of_others_as_by_a_loop(table, misfit, beside):
     noise = ReceiverNoise(std=1.3)
-    found = cover_misfit(table, SystemPulse(2.0, misfit=misfit, beside=beside, noise=noise), 0.5)
+    system = SystemPulse(2.0, misfit=misfit, beside=beside, noise=noise)
+    found = cover(table, system)
     variance = np.zeros(len(table))
     for i, j, lag in pairs(table):
         more = np.interp(lag, *np.array(beside).T) if beside and abs(lag) < 21 and table.amplitude[j] > 26 else 0.0
@@ -132,25 +148,68 @@ def test_what_is_left_beside_echoes_is_in_the_errors_of_others_as_by_a_loop(tabl
     for name in ERRORS:
         np.testing.assert_allclose(getattr(found, name), getattr(table, name) * np.sqrt(1 + variance), rtol=1e-5)
     assert variance.max() > 2
-    assert cover_misfit(table, SystemPulse(2.0), 0.5) is table
+    np.testing.assert_allclose(misfit_factor(table, system, 0.5), np.sqrt(1 + variance), rtol=1e-5)
+    same = cover(table, SystemPulse(2.0))
+    assert all((getattr(same, name) == getattr(table, name)).all() for name in ERRORS)
 
 
 @pytest.mark.parametrize("misfit", [0.0, 0.05])
 def test_errors_grow_where_a_fit_misses_its_samples(table, rng, misfit):
     table = replace(table, residual=rng.uniform(0.7, 6, len(table)).astype(np.float32))
     system = SystemPulse(2.0, misfit=misfit, noise=ReceiverNoise(std=1.3))
+    factor = missed(table, misfit)
+    np.testing.assert_allclose(find_unexplained(table, system, 0.5), factor, rtol=1e-5)
+    sure, found = cover(replace(table, residual=np.ones_like(table.residual)), system), cover(table, system)
+    for name in ERRORS:
+        np.testing.assert_allclose(getattr(found, name), getattr(sure, name) * np.sqrt(factor), rtol=1e-5)
+    assert 0.2 < np.mean(factor > 1) < 0.9
+
+
+def missed(table, misfit):
+    """chi2 per sample of each echo over what is expected, 1 where chance explains it."""
     samples, factor = 8 * 2.0 / 0.5, np.ones(len(table))
     for i in range(len(table)):
         own = np.flatnonzero(table.waveform == table.waveform[i])
         energy = sum(table.amplitude[j] ** 2 * table.sigma[j] for j in own) * np.sqrt(np.pi) / 0.5 / 1.3**2
         chi2 = table.residual[i] ** 2 / (1 + misfit**2 * energy / samples)
         factor[i] = chi2 if chi2 > 1 + 4 * np.sqrt(2 / samples) else 1.0
-    np.testing.assert_allclose(find_unexplained(table, system, 0.5), factor, rtol=1e-5)
-    sure = cover_misfit(replace(table, residual=np.ones_like(table.residual)), system, 0.5)
-    found = cover_misfit(table, system, 0.5)
-    for name in ERRORS:
-        np.testing.assert_allclose(getattr(found, name), getattr(sure, name) * np.sqrt(factor), rtol=1e-5)
-    assert 0.2 < np.mean(factor > 1) < 0.9
+    return factor
+
+
+def test_colour_and_misfits_of_echoes_that_are_left_are_given_by_their_rows(table, rng):
+    system = SystemPulse(2.0, misfit=0.05, noise=ReceiverNoise(std=1.3))
+    factors = rng.uniform(0.5, 1.5, (len(table), 4))
+    found, row, grown = finish(
+        table, factors, twins=TWINS, overlap=OVERLAP, unresolved=UNRESOLVED, unexplained=unexplained(system, 0.5),
+        others=True,
+    )  # fmt: skip
+    before = finish(table, twins=TWINS, overlap=OVERLAP, unresolved=UNRESOLVED)[0]
+    assert len(found) == len(row) < len(table) and (np.diff(row) > 0).all()
+    expected = np.minimum(factors[row, 0], 1.0) * found.amplitude_err / before.amplitude_err
+    np.testing.assert_allclose(grown, expected, rtol=1e-6)
+
+
+def test_echoes_inside_of_gaps_are_left_out(table):
+    missing = np.zeros((N, S), bool)
+    missing[::3, 25:33] = missing[1::3, :4] = missing[1::3, 40:] = missing[2::9, 57:] = True
+    missing[2::9, 20:22] = missing[2::9, 23:30] = True
+    missing[5::9] = True
+    left = []
+    for i in range(len(table)):
+        gaps, k, away = missing[table.waveform[i]], 0, np.inf
+        while k < S:
+            end = k
+            while end < S and gaps[end]:
+                end += 1
+            if end > k:
+                away = min(away, max(k - 1 - table.time[i], table.time[i] - end))
+            k = end + 1
+        if away >= -max(0.5 * table.sigma[i], 1.0):
+            left.append(i)
+    found, row, _ = finish(table, missing=missing, gaps=1.0)
+    assert row.tolist() == left
+    np.testing.assert_array_equal(found.relative_energy_err, table.relative_energy_err[left])
+    assert len(table) // 2 < len(left) < len(table) - 30
 
 
 def test_the_weaker_of_two_echoes_in_one_place_is_dropped(table):
@@ -163,7 +222,7 @@ def test_the_weaker_of_two_echoes_in_one_place_is_dropped(table):
         if same and near and not table.flags[i] & table.flags[i + 1] & OVERLAPPED:
             dropped.add(i if table.amplitude[i] < table.amplitude[i + 1] else i + 1)
     left = [i for i in range(len(table)) if i not in dropped]
-    np.testing.assert_array_equal(drop_twins(table).amplitude, table.amplitude[left])
+    np.testing.assert_array_equal(finish(table, twins=TWINS)[0].amplitude, table.amplitude[left])
     assert dropped
 
 
@@ -185,7 +244,7 @@ def test_pairs_that_are_not_resolved_become_one_with_their_moments(table):
                 left.append(echoes[i])
                 i += 1
         echoes = sorted(left, key=lambda echo: (echo["waveform"], echo["time"]))
-    found = merge_unresolved(table)
+    found = finish(table, overlap=OVERLAP, unresolved=UNRESOLVED)[0]
     assert len(found) == len(echoes) < len(table) - 40
     for name in names:
         np.testing.assert_allclose(getattr(found, name), [echo[name] for echo in echoes], rtol=2e-5, err_msg=name)
@@ -217,9 +276,9 @@ def test_an_echo_whose_companions_are_gone_is_not_overlapped():
     flags = np.array([overlapped, overlapped, overlapped, overlapped | merged, 0, overlapped | 1])
     one = np.ones(6)
     table = EchoTable.build(waveform, np.arange(6.0), one, one, flags=flags)
-    assert clear_lone(table).flags.tolist() == [0, overlapped, overlapped, overlapped | merged, 0, 1]
-    assert table.flags.tolist() == flags.tolist()
-    assert len(clear_lone(EchoTable.empty())) == 0
+    found = finish(table, lone=True)[0]
+    assert found.flags.tolist() == [0, overlapped, overlapped, overlapped | merged, 0, 1]
+    assert len(finish(EchoTable.empty(), lone=True)[0]) == 0
 
 
 def test_echoes_of_no_waveform_are_refused(table):

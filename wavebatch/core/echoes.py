@@ -242,10 +242,14 @@ class EchoTable:
         """A table without echoes."""
         return cls.build(*np.empty((4, 0)))
 
+    def columns(self) -> dict[str, np.ndarray]:
+        """The core columns by name."""
+        return {name: getattr(self, name) for name in _FIELDS}
+
     def take(self, rows: np.ndarray) -> EchoTable:
         """The echoes at `rows` (indices or mask), in that order."""
         rows = np.arange(len(self))[rows]  # once for all columns
-        core = {name: getattr(self, name).take(rows) for name in _FIELDS}
+        core = {name: values.take(rows) for name, values in self.columns().items()}
         others = {name: values.take(rows, axis=0) for name, values in self.attributes.items()}
         return EchoTable(**core, attributes=others)
 
@@ -282,7 +286,7 @@ class EchoTable:
         >>> rows = echoes.to_numpy()
         >>> rows["amplitude"][rows["flags"] == 0].mean()
         """
-        columns = {**{name: getattr(self, name) for name in _FIELDS}, **self.attributes}
+        columns = {**self.columns(), **self.attributes}
         rows = np.empty(len(self), [(name, values.dtype, values.shape[1:]) for name, values in columns.items()])
         for name, values in columns.items():
             rows[name] = values

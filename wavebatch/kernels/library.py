@@ -23,7 +23,7 @@ FUNCTIONS = (
     "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "describe_widths",
     "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes",
-    "match_returns", "find_faint", "weigh_fits", "set_flags", "find_pairs",
+    "match_returns", "weigh_fits", "finish_echoes",
     "find_pulses", "find_nearest", "number_returns", "share_offsets", "find_around", "measure_lobes",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
@@ -242,6 +242,17 @@ class CFlagging(ctypes.Structure):
     _fields_ = _fields(ctypes.c_double, "spacing last sigma_ref narrow level reach unreliable")
 
 
+class CFinishing(ctypes.Structure):
+    """`Finishing` of kernels/c/finish.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_double, "gaps twins overlap unresolved"),
+        *_fields(_POINTER, "unproven unexplained"),
+        *_fields(ctypes.c_int64, "others lone"),
+        *_fields(_POINTER, "flagging ringing factors"),
+    ]
+
+
 class Samples(NamedTuple):
     """n waveforms of s samples, with their noise."""
 
@@ -254,8 +265,11 @@ class Samples(NamedTuple):
     missing: np.ndarray | None = None
     """Samples that were not recorded, bool (n, s); None where there is none."""
 
-    def checked(self) -> Samples:
-        """The same as the library reads it; raises ValueError where it would read outside of the arrays."""
+    def checked(self, *, finite: bool = True) -> Samples:
+        """The same as the library reads it; raises ValueError where it would read outside of the arrays.
+
+        finite: values must be, for arithmetic; comparisons need only the shapes.
+        """
         counts, baseline, std, missing = self
         n, s = counts.shape
         if counts.dtype not in (np.uint8, np.uint16, np.uint32, np.float32):
@@ -264,13 +278,18 @@ class Samples(NamedTuple):
             raise ValueError(f"levels or noise do not have the shape of {n} waveforms of {s} samples")
         if missing is not None and missing.shape != (n, s):
             raise ValueError(f"gaps do not have the shape of {n} waveforms of {s} samples")
+        if finite:
+            self._check_values()
+        flat = (np.ascontiguousarray(baseline, np.float32), np.ascontiguousarray(std, np.float32))
+        gaps = None if missing is None else np.ascontiguousarray(missing, np.bool_)
+        return Samples(np.ascontiguousarray(counts), *flat, gaps)
+
+    def _check_values(self) -> None:
+        counts, baseline, std, missing = self
         if not (np.isfinite(baseline).all() and np.isfinite(std).all() and (std > 0).all()):
             raise ValueError("levels and noise must be finite, and the noise above 0")
         if counts.dtype == np.float32 and not np.isfinite(counts if missing is None else counts[~missing]).all():
             raise ValueError("samples must be finite where they are not missing")
-        flat = (np.ascontiguousarray(baseline, np.float32), np.ascontiguousarray(std, np.float32))
-        gaps = None if missing is None else np.ascontiguousarray(missing, np.bool_)
-        return Samples(np.ascontiguousarray(counts), *flat, gaps)
 
     def as_block(self) -> Block:
         """The structure, which points into these arrays."""

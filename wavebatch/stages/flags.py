@@ -7,13 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit import neighbours
-from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
+from wavebatch.kernels.fit.neighbours import Faintness, Finishing, Flagging, Unexplained, finish_echoes, weigh_fits
 from wavebatch.kernels.library import Samples
-from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.pulse_tables import clip_level, fit_misfit
 
 NEIGHBOURS = 5
@@ -78,27 +76,29 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
     EchoTable
         The same echoes with these flags.
     """
+    columns = table.columns() | {"flags": table.flags.copy()}  # these steps change nothing else
+    found = finish_echoes(columns, np.arange(len(table)), levels_of(block, noise), flagging(block, system))[0]
+    return replace(table, flags=found["flags"])
+
+
+def levels_of(block: WaveformBlock, noise: Noise) -> Samples:
+    """Return raw counts with the one level of each waveform, for flags."""
+    return Samples(block.samples, noise.baseline, noise.std, block.missing)
+
+
+def flagging(block: WaveformBlock, system: SystemPulse) -> Finishing:
+    """Return the steps of `flag_echoes`."""
     ref, last = system.sigma_ref, (block.samples.shape[1] - 1) * block.spacing
     law = Flagging(block.spacing, last, ref, 0.93 * ref, clip_level(block, system), CLIPPED_REACH, UNRELIABLE_BELOW)
-    samples = Samples(block.samples, noise.baseline, noise.std, block.missing)
-    table = replace(table, flags=neighbours.set_flags(table, samples, law))
-    if block.missing is not None:
-        away = gap_distance(block.missing, table.waveform, table.time / block.spacing)
-        table = table.with_flags(EchoFlag.NEAR_EDGE, away * block.spacing < table.sigma)
-    if system.ringing > 0:
-        ringing = Faintness(RINGING_FACTOR * system.ringing, 2.0 * ref, RINGING_REACH * ref)
-        suspect = neighbours.find_faint(table, ringing) & (table.amplitude > 0)
-        table = table.with_flags(EchoFlag.RINGING_SUSPECT, suspect)
-    return table
+    ringing = Faintness(RINGING_FACTOR * system.ringing, 2.0 * ref, RINGING_REACH * ref) if system.ringing > 0 else None
+    return Finishing(flagging=law, ringing=ringing)
 
 
-def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) -> EchoTable:
-    """Drop echoes that are so faint next to a stronger one that an error of its pulse, or of its tail, explains them.
+def unproven(system: SystemPulse, top: float = np.inf) -> Faintness | None:
+    """Return which echoes are so faint beside a stronger one that an error of its pulse or of its tail explains them.
 
     Parameters
     ----------
-    table : EchoTable
-        Fitted echoes.
     system : SystemPulse
         With the components of the learned pulse, what is known of it, and the misfit of its tail.
     top : float
@@ -106,9 +106,11 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
 
     Returns
     -------
-    EchoTable
-        The remaining echoes.
+    Faintness, optional
+        None where none is.
     """
+    if not (system.components or system.tail_misfit):
+        return None
     ref, law = system.sigma_ref, Faintness()
     if system.components:
         delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
@@ -120,17 +122,17 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
             tail=system.tail_misfit, close=0.6 * ref, apart=2.5 * ref, beside=BESIDE * ref, factor=TAIL_FACTOR,
             far_factor=FAR_TAIL_FACTOR, known=KNOWN, after=True,
         )  # fmt: skip
-    faint = neighbours.find_faint(table, law)
-    return table.take(np.flatnonzero(~faint)) if faint.any() else table
+    return law
 
 
-def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
-    """Add to the errors what fits leave unexplained, of the echo itself and of those beside it.
+def unexplained(system: SystemPulse, spacing: float) -> Unexplained:
+    """Return what fits leave unexplained, of the echo itself and of those beside it, for errors that cover it.
+
+    What is left beside a strong one, and of its core, counts as noise that moves an amplitude as far; errors of a fit
+    that is `find_unexplained` grow with the root of chi2.
 
     Parameters
     ----------
-    table : EchoTable
-        Fitted echoes.
     system : SystemPulse
         With the misfit of its pulse.
     spacing : float
@@ -138,21 +140,30 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
 
     Returns
     -------
-    EchoTable
-        The same echoes. What is left beside a strong one, and of its core, counts as noise that moves an amplitude as
-        far; errors of a fit that is `find_unexplained` grow with the root of chi2.
+    Unexplained
 
     References
     ----------
     docs/algorithms.md R3.
     """
-    return scale_errors(table, misfit_factor(table, system, spacing))
+    ref, std, samples = system.sigma_ref, system.noise.std, SPAN * system.sigma_ref / spacing
+    return Unexplained(
+        core=CORE * ref, misfit=CORE_STD * system.misfit, clear=CLEAR * std, beside=BESIDE * ref,
+        energy=SQRT_PI * ref / spacing / std**2, left=system.beside, unit=SQRT_PI, spacing=spacing, variance=std**2,
+        misfit2=fit_misfit(system, spacing) ** 2, samples=samples,
+        limit=1 + BEYOND_CHANCE * float(np.sqrt(2 / samples)),
+    )  # fmt: skip
+
+
+def leave_beside(system: SystemPulse) -> bool:
+    """Whether echoes leave anything beside them that errors of others must cover."""
+    return bool(system.misfit or system.beside)
 
 
 def misfit_factor(table: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
-    """Return by how much errors (m,) are larger than those of noise alone; arguments as for `cover_misfit`."""
-    unexplained, variance = _find_unexplained(table, system, spacing, others=bool(system.misfit or system.beside))
-    return np.sqrt(unexplained * (1 + variance))
+    """Return by how much errors of fitted echoes are larger than those of noise alone (m,); else as `unexplained`."""
+    missed, variance = weigh_fits(table, unexplained(system, spacing), others=leave_beside(system))
+    return np.sqrt(missed * (1 + variance))
 
 
 def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
@@ -160,8 +171,10 @@ def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> E
 
     Parameters
     ----------
-    table, system, spacing
-        As for `cover_misfit`, which grew them.
+    table : EchoTable
+        Fitted echoes.
+    system, spacing
+        As for `unexplained`, by which their errors grew.
 
     Returns
     -------
@@ -185,29 +198,17 @@ def find_unexplained(table: EchoTable, system: SystemPulse, spacing: float) -> n
 
     Parameters
     ----------
-    table, system, spacing
-        As for `cover_misfit`.
+    table : EchoTable
+        Fitted echoes.
+    system, spacing
+        As for `unexplained`.
 
     Returns
     -------
     float64 array, shape (m,)
         chi2 per sample of the echo's fit, over what is expected; 1 where chance explains it.
     """
-    return _find_unexplained(table, system, spacing, others=False)[0]
-
-
-def _find_unexplained(
-    table: EchoTable, system: SystemPulse, spacing: float, *, others: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same, and what others leave beside each echo, in its variance."""
-    ref, std, samples = system.sigma_ref, system.noise.std, SPAN * system.sigma_ref / spacing
-    law = Unexplained(
-        core=CORE * ref, misfit=CORE_STD * system.misfit, clear=CLEAR * std, beside=BESIDE * ref,
-        energy=SQRT_PI * ref / spacing / std**2, left=system.beside, unit=SQRT_PI, spacing=spacing, variance=std**2,
-        misfit2=fit_misfit(system, spacing) ** 2, samples=samples,
-        limit=1 + BEYOND_CHANCE * float(np.sqrt(2 / samples)),
-    )  # fmt: skip
-    return neighbours.weigh_fits(table, law, others=others)
+    return weigh_fits(table, unexplained(system, spacing), others=False)[0]
 
 
 def list_neighbours(table: EchoTable) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -230,23 +231,3 @@ def list_neighbours(table: EchoTable) -> Iterator[tuple[np.ndarray, np.ndarray, 
         lag = table.time[first + step] - table.time[first]
         yield first + step, first, lag
         yield first, first + step, -lag
-
-
-def clear_lone(table: EchoTable) -> EchoTable:
-    """Clear OVERLAPPED where no other echo of the waveform has it: its partners in the fit were dropped.
-
-    Parameters
-    ----------
-    table : EchoTable
-        Fitted echoes.
-
-    Returns
-    -------
-    EchoTable
-        The same echoes.
-    """
-    overlapped = (table.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
-    merged = (table.flags & np.uint16(EchoFlag.MERGED)) != 0
-    number = np.bincount(table.waveform[overlapped], minlength=int(table.waveform.max(initial=0)) + 1)
-    lone = overlapped & ~merged & (number[table.waveform] == 1)
-    return replace(table, flags=np.where(lone, table.flags & ~np.uint16(EchoFlag.OVERLAPPED), table.flags))

@@ -113,15 +113,20 @@ def fit_misfit(system: SystemPulse, spacing: float) -> float:
     float
         Share of the amplitude.
     """
-    if not (system.noise.whitening and system.misfit):
+    noise = system.noise
+    if not (noise.whitening and system.misfit):
         return system.misfit
-    ref = system.sigma_ref / spacing
+    return system.misfit * _misfit_gain(noise.whitening, noise.std / noise.quiet, system.sigma_ref / spacing)
+
+
+@lru_cache(maxsize=16)
+def _misfit_gain(whitening: tuple[float, ...], gain: float, ref: float) -> float:
     z = np.arange(-np.ceil(6 * ref), np.ceil(6 * ref) + 1) / ref
     bell = exp(-0.5 * z * z)
     both = (8 * z**3 - 12 * z) * bell, (16 * z**4 - 48 * z**2 + 12) * bell
-    taps = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet)[2]
+    taps = whitening_filter(whitening, gain)[2]
     gains = [np.sum(np.convolve(one, taps) ** 2) / np.sum(one * one) for one in both]
-    return system.misfit * max(float(np.sqrt(max(gains))), 1.0)
+    return max(float(np.sqrt(max(gains))), 1.0)
 
 
 class ShapeLimits(NamedTuple):

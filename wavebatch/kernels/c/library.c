@@ -19,6 +19,7 @@
 #include "elementary.h"
 #include "echoes.h"
 #include "neighbours.h"
+#include "finish.h"
 #include "returns.h"
 #include "stack.h"
 #include "wdz.h"

@@ -1,5 +1,5 @@
 /* Echoes beside others of their waveform, and over their samples: which ones errors of a stronger one explain, what those
-   errors add, and flags. stages/flags.py and stages/decompose/merge.py have the reasons.
+   errors add, and flags. finish.h takes echoes through them; stages/flags.py and stages/decompose/merge.py have the reasons.
 
    Columns are float32, and so are products with them. */
 
@@ -69,14 +69,13 @@ static int is_faint(const Table *t, const Faintness *f, int64_t row, int64_t oth
 }
 
 /* Marks echoes that an error of another one of their waveform explains. */
-EXPORT int64_t find_faint(const Table *t, const Faintness *f, uint8_t *faint) {
+static void find_faint(const Table *t, const Faintness *f, uint8_t *faint) {
     for (int64_t i = 0, end = 0; i < t->m; i++) {
         faint[i] = 0;
         if (i == end) end = end_of_waveform(t, i);
         for (int64_t j = i > NEIGHBOURS ? i - NEIGHBOURS : 0; j < end && j <= i + NEIGHBOURS && !faint[i]; j++)
             if (j != i && t->waveform[j] == t->waveform[i]) faint[i] = is_faint(t, f, i, j);
     }
-    return 0;
 }
 
 /* chi2 per sample of each echo's fit over what is expected, 1 where chance explains it; and, unless NULL, what others of
@@ -120,7 +119,7 @@ static int is_clipped(const Block *b, int64_t waveform, int64_t from, int64_t to
 }
 
 /* Sets flags of echoes that need no fit; waveforms have one level each. */
-EXPORT int64_t set_flags(const Table *t, const Block *b, const Flagging *f, uint16_t *flags) {
+static void set_flags(const Table *t, const Block *b, const Flagging *f, uint16_t *flags) {
     const int64_t s = b->length;
     const double level = b->bytes ? f->level : (float)f->level;
     for (int64_t i = 0; i < t->m; i++) {
@@ -135,13 +134,12 @@ EXPORT int64_t set_flags(const Table *t, const Block *b, const Flagging *f, uint
             set |= FLAG_SATURATED | ((float)f->unreliable * amplitude > (float)f->level - b->baseline[waveform] ? FLAG_UNRELIABLE : 0);
         flags[i] = t->flags[i] | set;
     }
-    return 0;
 }
 
 /* First rows of pairs of neighbours of a waveform that are one: closer than `width` of the narrower one, and, with
    `error` above 0, than so many errors of their distance. Two echoes of one fit, or without `error` of different fits.
    Returns the number of pairs; with `error` no row is in two. */
-EXPORT int64_t find_pairs(const Table *t, double width, double error, int64_t *first) {
+static int64_t find_pairs(const Table *t, double width, double error, int64_t *first) {
     int64_t found = 0, free_from = 0;
     for (int64_t i = 0; i + 1 < t->m; i++) {
         if (t->waveform[i] != t->waveform[i + 1] || i < free_from) continue;

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.kernels import library
+from wavebatch.kernels.fit.neighbours import COLUMNS
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseShape
 from wavebatch.kernels.library import Samples, call, place
 
@@ -417,7 +418,7 @@ def keep_echoes(
         raise ValueError("columns of fits, clusters or factors differ in length")
     if n and not 0 <= waveform.min() <= waveform.max() < len(std):
         raise ValueError("a cluster lies in no waveform")
-    columns = {name: np.empty(m, kind) for name, kind in _COLUMNS.items()}
+    columns = {name: np.empty(m, kind) for name, kind in (COLUMNS | {"row": np.int64}).items()}
     kept = call(
         "keep_echoes", library.CClusters(n, library.address(waveform)),
         library.Echoes(m, *map(library.address, fits)), whole.as_structure(fits[4][:, 2]),
@@ -429,6 +430,3 @@ def keep_echoes(
 
 
 _SOLUTION = (np.int64, np.bool_, *[np.float64] * 5, np.bool_)
-_FLOATS = ("amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "relative_energy_err", "residual")
-_COLUMNS = {"waveform": np.int32, "time": np.float64, **dict.fromkeys(_FLOATS, np.float32), "flags": np.uint16,
-            "row": np.int64}  # fmt: skip

@@ -1,7 +1,7 @@
 """Echoes beside others of their waveform, and over their samples: the loops of stages/flags.py and decompose/merge.py.
 
-They are compiled (kernels/c/neighbours.h): an echo has few neighbours, so arrays of pairs cost more than the pairs.
-Laws say which echoes are faint, or what fits leave unexplained; stages make them from what the survey knows.
+They are compiled (kernels/c/neighbours.h, finish.h): an echo has few neighbours, so arrays of pairs cost more than the
+pairs. Laws say which echoes are faint, or what fits leave unexplained; stages make them from what the survey knows.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from wavebatch.kernels.library import Samples, call, place
 Points = tuple[tuple[float, float], ...]
 """Lag [ns] and value, ascending: lines between them."""
 
-_COLUMNS = {"waveform": np.int32, "time": np.float64, "amplitude": np.float32, "sigma": np.float32,
-            "time_err": np.float32, "amplitude_err": np.float32, "sigma_err": np.float32, "residual": np.float32,
-            "flags": np.uint16}  # fmt: skip
+_FLOATS = "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "relative_energy_err", "residual"
+COLUMNS = {"waveform": np.int32, "time": np.float64, **dict.fromkeys(_FLOATS, np.float32), "flags": np.uint16}
+"""Core columns of an EchoTable, in the order of `Kept` of kernels/c/echoes.h."""
 
 
 class Faintness(NamedTuple):
@@ -88,32 +88,13 @@ class Flagging(NamedTuple):
     """AMPLITUDE_UNRELIABLE: this share of the amplitude is above the level."""
 
 
-def find_faint(echoes: Any, law: Faintness) -> np.ndarray:
-    """Find echoes that an error of a stronger one of their waveform explains.
-
-    Parameters
-    ----------
-    echoes : with the core columns of an EchoTable, arrays (m,)
-        Sorted by waveform, then time.
-    law : Faintness
-
-    Returns
-    -------
-    bool (m,)
-    """
-    table, faint = _as_table(echoes), np.empty(len(echoes.time), np.bool_)
-    curve = _as_curve(law.tail)
-    call("find_faint", table, library.CFaintness(**law._asdict() | {"tail": curve}), faint)
-    return faint
-
-
 def weigh_fits(echoes: Any, law: Unexplained, *, others: bool) -> tuple[np.ndarray, np.ndarray]:
     """Find by how much fits miss their samples, and what echoes leave beside others.
 
     Parameters
     ----------
-    echoes
-        As for `find_faint`.
+    echoes : with the core columns of an EchoTable, arrays (m,)
+        Sorted by waveform, then time.
     law : Unexplained
     others : bool
         Whether others of the waveform leave anything.
@@ -126,67 +107,113 @@ def weigh_fits(echoes: Any, law: Unexplained, *, others: bool) -> tuple[np.ndarr
         Largest of what the others leave, in the variance of the echo; 0 without `others`.
     """
     table, (unexplained, beside) = _as_table(echoes), np.zeros((2, len(echoes.time)))
-    curve = _as_curve(law.left or ((0.0, 0.0),))
-    given = library.CUnexplained(**law._asdict() | {"left": curve})
-    call("weigh_fits", table, given, unexplained, beside if others else None)
+    call("weigh_fits", table, _as_unexplained(law), unexplained, beside if others else None)
     return unexplained, beside
 
 
-def set_flags(echoes: Any, samples: Samples, law: Flagging) -> np.ndarray:
-    """Set the flags WEAK, NEAR_EDGE (of the waveform), NARROW, SATURATED and AMPLITUDE_UNRELIABLE.
+class Finishing(NamedTuple):
+    """Steps from echoes of fits to a table, in their order; what has its default is left out."""
+
+    gaps: float = 0.0
+    """Time between two samples [ns]: echoes inside of gaps are left out."""
+    twins: float = 0.0
+    """Of two neighbours of separate fits that are closer than so many widths of the narrower one, the weaker goes."""
+    overlap: float = 0.0
+    """Two of one fit that are closer than so many widths become one, where ..."""
+    unresolved: float = 0.0
+    """... they are closer than so many errors of their distance."""
+    unproven: Faintness | None = None
+    """Echoes that errors of a stronger one explain go."""
+    unexplained: Unexplained | None = None
+    """Errors grow by what fits leave unexplained."""
+    others: bool = False
+    """And by what others of the waveform leave."""
+    lone: bool = False
+    """OVERLAPPED goes where no other echo of the waveform has it."""
+    flagging: Flagging | None = None
+    """WEAK, NEAR_EDGE, NARROW, SATURATED and AMPLITUDE_UNRELIABLE are set."""
+    ringing: Faintness | None = None
+    """RINGING_SUSPECT is set."""
+
+
+def finish_echoes(
+    columns: dict[str, np.ndarray],
+    row: np.ndarray,
+    samples: Samples,
+    steps: Finishing,
+    factors: np.ndarray | None = None,
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray | None]:
+    """Take echoes through the steps, in the arrays that are given: these hold anything afterwards.
 
     Parameters
     ----------
-    echoes
-        As for `find_faint`.
+    columns : dict of arrays (m,)
+        The core columns of an EchoTable, sorted by waveform, then time.
+    row : int64 (m,)
+        A number of each echo, for other columns.
     samples : Samples
         Of n waveforms, with one level each.
-    law : Flagging
+    steps : Finishing
+    factors : float64 (k, 4), optional
+        By `row`: on the errors of the fits, for `grown`.
 
     Returns
     -------
-    uint16 (m,)
-        The flags that they had, and these.
+    columns, row
+        Of the echoes that are left, views of the arrays.
+    grown : float32 array, optional
+        With `factors`, of the amplitudes' errors: the factor, up to 1, times that of `unexplained`.
     """
-    samples, table, flags = samples.checked(), _as_table(echoes), np.empty(len(echoes.time), np.uint16)
+    samples, m = samples.checked(finite=False), len(row)
     if samples.baseline.ndim != 1:
         raise ValueError("a waveform has more than one level")
-    if len(flags) and not 0 <= echoes.waveform.min() <= echoes.waveform.max() < len(samples.counts):
+    if m and not 0 <= columns["waveform"].min() <= columns["waveform"].max() < len(samples.counts):
         raise ValueError("an echo lies in no waveform")
-    call("set_flags", table, samples.as_block(), library.CFlagging(*law), flags)
-    return flags
-
-
-def find_pairs(echoes: Any, width: float, error: float = 0.0) -> np.ndarray:
-    """Find neighbours that are one echo.
-
-    Parameters
-    ----------
-    echoes
-        As for `find_faint`.
-    width : float
-        They are closer than so many widths of the narrower one.
-    error : float
-        They were fitted together, and are closer than so many errors of their distance; no echo is in two pairs. Of 0:
-        they were fitted apart.
-
-    Returns
-    -------
-    int64 (k,)
-        First row of each pair.
-    """
-    first = np.empty(len(echoes.time), np.int64)
-    return first[: call("find_pairs", _as_table(echoes), ctypes.c_double(width), ctypes.c_double(error), first)]
+    columns = {name: np.ascontiguousarray(columns[name], kind) for name, kind in COLUMNS.items()}
+    if {len(column) for column in columns.values()} != {m}:
+        raise ValueError("columns of echoes differ in length")
+    if factors is not None and (factors.shape[1:] != (4,) or (m and not 0 <= row.min() <= row.max() < len(factors))):
+        raise ValueError("an echo has no factors")
+    laws = {
+        "unproven": steps.unproven and _as_faintness(steps.unproven),
+        "unexplained": steps.unexplained and _as_unexplained(steps.unexplained),
+        "flagging": steps.flagging and library.CFlagging(*steps.flagging),
+        "ringing": steps.ringing and _as_faintness(steps.ringing),
+    }
+    given = steps._asdict() | {name: law and ctypes.addressof(law) for name, law in laws.items()}
+    structure = library.CFinishing(**given, factors=None if factors is None else place(factors, np.float64))
+    kept = library.CKept(*map(library.address, columns.values()), place(row, np.int64))
+    grown = None if factors is None else np.empty(m, np.float32)
+    left = call("finish_echoes", ctypes.c_int64(m), kept, samples.as_block(), structure, grown)
+    found = {name: column[:left] for name, column in columns.items()}
+    return found, row[:left], None if grown is None else grown[:left]
 
 
 def _as_table(echoes: Any) -> library.CTable:
     """The structure, which points into the columns."""
-    columns = [np.ascontiguousarray(getattr(echoes, name), kind) for name, kind in _COLUMNS.items()]
+    names = [field[0] for field in library.CTable._fields_[1:]]
+    columns = [np.ascontiguousarray(getattr(echoes, name), COLUMNS[name]) for name in names]
     if {len(column) for column in columns} != {len(columns[0])}:
         raise ValueError("columns of echoes differ in length")
     table = library.CTable(len(columns[0]), *map(library.address, columns))
     table.arrays = columns
     return table
+
+
+def _as_faintness(law: Faintness) -> library.CFaintness:
+    """The structure, which holds the arrays to which it points."""
+    curve = _as_curve(law.tail)
+    structure = library.CFaintness(*law[:6], curve, *law[7:])
+    structure.arrays = curve.arrays
+    return structure
+
+
+def _as_unexplained(law: Unexplained) -> library.CUnexplained:
+    """As `_as_faintness`."""
+    curve = _as_curve(law.left or ((0.0, 0.0),))
+    structure = library.CUnexplained(*law[:5], curve, *law[6:])
+    structure.arrays = curve.arrays
+    return structure
 
 
 def _as_curve(points: Points) -> library.CCurve:

@@ -1,6 +1,6 @@
-"""Echoes too close to be resolved: fitted ones are merged (docs/algorithms.md H1), hidden ones enlarge the errors.
+"""Echoes too close to be resolved: which fits are merged (docs/algorithms.md H1); hidden ones enlarge the errors.
 
-Called after every fit.
+Used after every fit; kernels/c/finish.h merges.
 """
 
 from __future__ import annotations
@@ -9,90 +9,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.elementary import interpolate
-from wavebatch.kernels.fit.neighbours import find_pairs
 
 UNRESOLVED = 0.25
-"""Distance, in its errors, below which two echoes are one, as in kernels/c/decompose.h."""
+"""Distance, in its errors, below which two echoes of one fit are one, as in kernels/c/decompose.h.
+
+One pair after the other, until no such pair is left. A separate fit on another echo's flank is no evidence about that
+echo. The merged echo has the area, mean time and variance of the pair, the errors of the better one, as together they
+are as well determined as one echo, and the flag MERGED.
+"""
 
 OVERLAP = 2.0
 """Only echoes closer than this many widths of the narrower one are merged: a weak echo further away has a poor time,
 but is another echo."""
 
 TWINS = 0.1
-"""Two echoes of separate fits that are closer than this many widths are the same echo."""
-
-
-def drop_twins(table: EchoTable) -> EchoTable:
-    """Drop the weaker of two neighbours that were fitted separately and ended in the same place.
-
-    Parameters
-    ----------
-    table : EchoTable
-        Fitted echoes.
-
-    Returns
-    -------
-    EchoTable
-        The remaining echoes.
-    """
-    twin = find_pairs(table, TWINS)
-    if not len(twin):
-        return table
-    keep = np.ones(len(table), bool)
-    weaker_first = table.amplitude[twin] < table.amplitude[twin + 1]
-    keep[np.where(weaker_first, twin, twin + 1)] = False
-    return table.take(np.flatnonzero(keep))
-
-
-def merge_unresolved(table: EchoTable) -> EchoTable:
-    """Merge neighbours that are closer than a quarter of the error of their distance, one pair after the other.
-
-    Only echoes that were fitted together are merged: a separate fit on another echo's flank is no evidence about that
-    echo.
-
-    The merged echo has the area, mean time and variance of the pair. Errors are copied from the better of the two
-    echoes: together the pair is as well determined as one echo. It has the flag MERGED.
-
-    Parameters
-    ----------
-    table : EchoTable
-        Fitted echoes.
-
-    Returns
-    -------
-    EchoTable
-        Resolved and merged echoes.
-    """
-    while True:
-        first = find_pairs(table, OVERLAP, UNRESOLVED)
-        if not len(first):
-            return table
-        a, b = table.take(first), table.take(first + 1)
-        area_a, area_b = (part.amplitude.astype(np.float64) * part.sigma for part in (a, b))
-        total = np.maximum(area_a + area_b, 1e-12)
-        share = area_a / total
-        time = share * a.time + (1 - share) * b.time
-        variance = share * (a.sigma**2 + (a.time - time) ** 2) + (1 - share) * (b.sigma**2 + (b.time - time) ** 2)
-        sigma = np.sqrt(variance)
-        relative = np.minimum(a.amplitude_err / a.amplitude, b.amplitude_err / b.amplitude)
-        merged = {
-            "time": time,
-            "amplitude": total / sigma,
-            "sigma": sigma,
-            "time_err": np.minimum(a.time_err, b.time_err),
-            "amplitude_err": relative * total / sigma,
-            "sigma_err": np.minimum(a.sigma_err, b.sigma_err),
-            "relative_energy_err": np.minimum(a.relative_energy_err, b.relative_energy_err),
-            "flags": a.flags | b.flags | np.uint16(EchoFlag.MERGED),
-        }
-        keep = np.ones(len(table), bool)
-        keep[first + 1] = False
-        table = table.take(np.flatnonzero(keep))
-        for name, values in merged.items():  # between its neighbours: the order stays
-            getattr(table, name)[first - np.arange(len(first))] = values
+"""Two echoes of separate fits that are closer than this many widths are the same echo: the weaker one is left out."""
 
 
 def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:

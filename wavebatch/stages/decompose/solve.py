@@ -14,16 +14,17 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import find_order
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit import decompose
+from wavebatch.kernels.fit.neighbours import finish_echoes
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, matched_gaussian, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.noise import whitening_filter
-from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
-from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
+from wavebatch.stages.decompose.merge import OVERLAP, TWINS, UNRESOLVED, cover_hidden
 from wavebatch.stages.detect.direct import choose_smoothing, samples_of
-from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes, scale_errors
+from wavebatch.stages.flags import flagging, leave_beside, levels_of, scale_errors, unexplained, unproven
 from wavebatch.stages.pulse_tables import (
     BROADEST,
     LEAST_WIDTH,
@@ -436,19 +437,16 @@ def describe_solution(
     factors = error_factors(fitted, spacing, widths, level_err)
     whole = whole_pulse(settings.shape, limits, widths)
     columns, row = decompose.keep_echoes(clusters, solution, whole, factors, noise.std, spacing, length, significance)
-    if CLUSTER in given:
-        # Colour that makes errors larger is left to the acceptance, which has made `noise.std` of it.
-        given = {**given, FACTOR: np.minimum(factors[:, 0], 1.0).astype(np.float32)}
-    table = EchoTable.build(**columns, attributes={name: values[row] for name, values in given.items()})
-    if block.missing is not None:
-        # An echo between two recorded samples is known, however narrow it is.
-        away = gap_distance(block.missing, table.waveform, table.time / spacing)
-        table = table.take(away >= -np.maximum(0.5 * table.sigma / spacing, 1.0))
-    table = merge_unresolved(drop_twins(table))
-    if settings.shape.components or not system.components:
-        table = drop_unproven(table, system, clip_level(block, system) - system.noise.baseline)
-    fitted_err = table.amplitude_err
-    table = cover_misfit(table, system, spacing)
-    if CLUSTER in given:
-        table = table.with_attributes(**{FACTOR: table.attributes[FACTOR] * table.amplitude_err / fitted_err})
-    return flag_echoes(block, noise, system, clear_lone(table))
+    order = find_order(columns["waveform"], columns["time"])
+    if order is not None:
+        columns, row = {name: values[order] for name, values in columns.items()}, row[order]
+    proves = bool(settings.shape.components) or not system.components
+    steps = flagging(block, system)._replace(
+        gaps=spacing, twins=TWINS, overlap=OVERLAP, unresolved=UNRESOLVED, lone=True,
+        unproven=unproven(system, clip_level(block, system) - system.noise.baseline) if proves else None,
+        unexplained=unexplained(system, spacing), others=leave_beside(system),
+    )  # fmt: skip
+    columns, row, grown = finish_echoes(columns, row, levels_of(block, noise), steps, factors)
+    left = {name: values[row] for name, values in given.items()}
+    # Colour that makes errors larger is left to the acceptance, which has made `noise.std` of it.
+    return EchoTable(**columns, attributes=left | ({FACTOR: grown} if CLUSTER in given else {}))
