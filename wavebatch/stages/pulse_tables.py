@@ -8,6 +8,7 @@ tables describe the whole pulse. Kernels place a skewed pulse by its peak; echo 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
@@ -221,17 +222,20 @@ def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...
 
     To the amplitude of a pulse of known time and width, and to amplitude, time and width of a fit.
     """
-    return np.array(colour_factors(correlation, *_pulse_rows(shape, width)))
+    return np.array(colour_factors(correlation, *_pulse_rows(shape, [width])[0]))
 
 
-def _pulse_rows(shape: PulseShape, width: float) -> np.ndarray:
-    """A pulse of amplitude 1 and its derivatives by time and width, at every sample where it is more than noise."""
-    width = min(max(width, NARROWEST_FACTOR), WIDEST_FACTOR)
-    reach = int(np.ceil(5 * width)) + 1
-    tail = max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)])
-    x = np.arange(-reach, min(max(reach, int(np.ceil(tail))), FARTHEST_FACTOR) + 1, dtype=np.float64)
-    rows = evaluate_pulse(shape, x[:, None], np.zeros(1), np.full(1, width))
-    return np.stack([np.asarray(row)[:, 0] for row in rows])
+def _pulse_rows(shape: PulseShape, widths: Sequence[float]) -> list[np.ndarray]:
+    """Pulses of amplitude 1 and their derivatives by time and width, at every sample where each is more than noise."""
+    widths = [min(max(width, NARROWEST_FACTOR), WIDEST_FACTOR) for width in widths]
+    reaches = [int(np.ceil(5 * width)) + 1 for width in widths]
+    tails = [max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)]) for width in widths]
+    ends = [min(max(reach, int(np.ceil(tail))), FARTHEST_FACTOR) for reach, tail in zip(reaches, tails, strict=True)]
+    most = max(reaches)
+    x = np.arange(-most, max(ends) + 1, dtype=np.float64)
+    rows = np.stack(evaluate_pulse(shape, x, np.zeros((len(widths), 1)), np.array(widths)[:, None]), axis=1)
+    parts = zip(rows, reaches, ends, strict=True)
+    return [np.ascontiguousarray(row[:, most - reach : most + end + 1]) for row, reach, end in parts]
 
 
 NARROWEST_FACTOR, WIDEST_FACTOR = 0.2, 200.0
@@ -276,36 +280,67 @@ def error_factors(
     if not noise.correlation and level_err is None:
         return np.ones((len(width), 4))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
-    alone = 1.0 if noise.whitening else max(noise_factors(shape, limits.ref, noise.correlation)[0], 1.0)
-    widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
+    table = _factor_table(shape, limits, noise.correlation, noise.whitening)
     # Only those beside a width that is asked for: to make all takes a tenth of a survey.
-    near = np.searchsorted(widths, np.append(width[~np.isnan(width)], limits.ref))
-    widths = widths[max(near.min() - 1, 0) : near.max() + 1]
-    given = noise.correlation, noise.whitening
-    found = np.stack([_factors_at(shape, limits, at, *given) for at in widths.tolist()])
-    factors, by_level = found[:, 0] / alone, found[:, 1]
+    asked = np.append(width[~np.isnan(width)], limits.ref)
+    low, high = np.searchsorted(table.widths, [asked.min(), asked.max()]).tolist()
+    low, high = max(low - 1, 0), high + 1
+    table.fill(low, high)
     if level_err is None:
-        return interpolate(width, widths, factors)
+        return interpolate(width, table.widths[low:high], table.factors[low:high, :4])
     if noise.whitening:
         level_err = level_err * noise.std / noise.quiet
-    found = interpolate(width, widths, np.hstack([factors, by_level]))
+    found = interpolate(width, table.widths[low:high], table.factors[low:high])
     found[:, 4:] *= level_err[:, None]
     found *= found
     return np.sqrt(found[:, :4] + found[:, 4:])
 
 
-@lru_cache(maxsize=16 * FACTOR_WIDTHS)
-def _factors_at(
-    shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...], whitening: tuple[float, ...]
-) -> np.ndarray:
-    """Errors of amplitude, time, width, energy in noise of this correlation, over those that the fit gives (2, 4).
+class _FactorTable:
+    """Factors of a pulse in some noise at widths, float64 (k, 8), made when they are asked for.
 
-    The second row are those by a level that is wrong by the noise of a sample.
+    They are errors of amplitude, time, width and energy over those that the fit gives, and the same by a level that is
+    wrong by the noise of a sample.
     """
-    joint = seen = _pulse_rows(shape, width)
+
+    def __init__(
+        self, shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...], whitening: tuple[float, ...]
+    ) -> None:
+        # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
+        self._alone = 1.0 if whitening else max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
+        self._given = shape, limits, correlation, whitening
+        self.widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
+        self.factors = np.full((FACTOR_WIDTHS, 8), np.nan)
+
+    def fill(self, low: int, high: int) -> None:
+        """Make the rows from low to high - 1."""
+        missing = low + np.flatnonzero(np.isnan(self.factors[low:high, 0]))
+        if not len(missing):
+            return
+        widths = self.widths[missing].tolist()
+        for row, width, joint in zip(missing, widths, _pulse_rows(self._given[0], widths), strict=True):
+            factors, by_level = _factors_at(joint, width, *self._given)
+            self.factors[row] = np.append(factors / self._alone, by_level)
+
+
+_factor_table = lru_cache(maxsize=16)(_FactorTable)
+
+
+def _factors_at(
+    joint: np.ndarray,
+    width: float,
+    shape: PulseShape,
+    limits: ShapeLimits,
+    correlation: tuple[float, ...],
+    whitening: tuple[float, ...],
+) -> np.ndarray:
+    """A row of `_FactorTable` (2, 4); joint: `_pulse_rows` of this width."""
+    seen = joint
     if whitening:
-        bare = np.stack([np.convolve(row, whitening_filter(whitening)[2]) for row in np.eye(joint.shape[1])])
+        s = joint.shape[1]
+        bare = np.zeros((s, s + 2))  # row i: what the filter makes of sample i
+        for later, tap in enumerate(whitening_filter(whitening)[2]):
+            bare.reshape(-1)[later :: s + 3][:s] = tap
         seen = np.einsum("is,sf->if", joint, bare)
     main = solve(np.einsum("if,jf->ij", seen, seen), seen)
     # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
