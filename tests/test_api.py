@@ -188,6 +188,19 @@ def test_survey_takes_a_path_and_says_what_the_command_says(strips):
     ]
 
 
+def test_waveforms_of_arrays_are_surveyed_and_decomposed(rng):
+    centre, height = rng.uniform(20, 60, 2000), rng.uniform(20, 200, 2000)
+    signal = height[:, None] * np.exp(-0.5 * ((np.arange(80) - centre[:, None]) / 2.3) ** 2)
+    block = wb.WaveformBlock.from_samples(np.rint(12 + signal + rng.normal(0, 1, signal.shape)).astype(np.uint8))
+    survey = wb.survey([block])
+    assert survey.waveforms == 2000 and survey.system.sigma_ref == pytest.approx(2.3, rel=0.01)
+    echoes = wb.auto_chain(survey).run(block, survey.system)
+    assert np.array_equal(echoes.waveform, np.arange(2000))
+    assert np.abs(echoes.time - centre).max() < 0.5
+    with pytest.raises(wb.ConfigError, match="needs the points of a strip"):
+        wb.survey([block], divergence=0.5)
+
+
 def test_a_strip_without_waveforms_cannot_be_surveyed(strips, tmp_path, edit_points):
     def strip_off(points):
         points["wavepacket_index"] = 0
@@ -273,6 +286,10 @@ def test_a_strip_that_fails_is_in_the_result(strips, tmp_path):
         ({"columns": "+echo_tim"}, "did you mean 'echo_time'"),
         ({"chain": "fast", "tolerance": 0.02}, "exclude each other"),
         ({"memory": 1000}, "too little"),
+        ({"columns": ["+echo_time"]}, r"--columns \['\+echo_time'\]: must be text or None"),
+        ({"overwrite": "no"}, "must be True or False"),
+        ({"jobs": "4"}, "must be a whole number"),
+        ({"bbox": "1,2,3,4"}, "must be a tuple or None"),
         ({"chain": "fast", "flight_height": 800.0}, None),
     ],
 )
@@ -286,7 +303,7 @@ def test_wrong_options_start_nothing(strips, tmp_path, options, words):
 
 
 def test_an_option_that_does_not_exist_is_a_type_error(strips, tmp_path):
-    with pytest.raises(TypeError, match="job"):
+    with pytest.raises(TypeError, match="has no option job; did you mean 'jobs'"):
         wb.run(strips[0], tmp_path, job=4)
 
 

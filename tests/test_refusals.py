@@ -527,7 +527,7 @@ def test_python_is_refused_what_the_command_line_is(kind):
             wrong = [math.nan, -math.inf, low - 1.0, *([low] if isinstance(one.limits, Above) else [])]
             wrong += [math.inf, 1e300, 10**400, high + max(1.0, 1e-9 * high)] if high < math.inf else []
         for value in wrong:
-            with pytest.raises(ConfigError, match="^--[a-z-]+ [^:]+: (must lie (from|above)|choose) "):
+            with pytest.raises(ConfigError, match="^--[a-z-]+ [^:]+: (must lie (from|above) |choose |must be a whole)"):
                 kind(**{**OPTIONS[kind], name: value})
 
 

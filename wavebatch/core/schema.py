@@ -7,9 +7,12 @@ and the help of an option too: `cli.options` makes click's options of them; Pyth
 from __future__ import annotations
 
 import functools
+import numbers
+import os
 import types
 import typing
 from dataclasses import field, fields
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from wavebatch.core.errors import ConfigError
@@ -147,14 +150,25 @@ def typed(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
+_FORMS: dict[type, tuple[type | tuple[type, ...], str]] = {
+    bool: (bool, "True or False"), int: (numbers.Integral, "a whole number"), float: (numbers.Real, "a number"),
+    str: (str, "text"), Path: (os.PathLike, "a path"), tuple: ((tuple, list), "a tuple"),
+    type(None): (type(None), "None"),
+}  # fmt: skip
+"""What Python may give for an option of a type, and its name in messages."""
+
+
 def check_options(options: Any) -> None:
-    """Raise ConfigError for an option that is none of its choices, or outside of its range."""
+    """Raise ConfigError for an option that is of another type, none of its choices, or outside of its range."""
     for name, one in declared_options(options.__class__).items():
         value, place = getattr(options, name), typed(one.words.name or name)
         if value is None and type(None) in one.kinds:
             continue
         if one.choices is not None and value not in one.choices:
             raise ConfigError(f"{place} {value!r}: choose {', '.join(map(str, one.choices))}")
+        forms = [_FORMS.get(typing.get_origin(kind) or kind, (object, "")) for kind in one.kinds]
+        if not any(isinstance(value, form) for form, _ in forms):
+            raise ConfigError(f"{place} {value!r:.40}: must be {' or '.join(dict.fromkeys(word for _, word in forms))}")
         if one.limits is not None and not one.limits.hold(value):
             raise ConfigError(f"{place} {value!s:.20}: must lie {one.limits}")
 

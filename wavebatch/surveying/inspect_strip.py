@@ -8,7 +8,7 @@ error in a file is a finding here, never an exception.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -324,7 +324,7 @@ def open_strip(path: Path | str, *, direction: str = "auto", headerless: bool = 
 
 
 def survey(
-    strip: Strip | Path | str,
+    strip: Strip | Path | str | Iterable[WaveformBlock],
     *,
     waveforms: int | None = None,
     divergence: float | None = None,
@@ -335,8 +335,9 @@ def survey(
 
     Parameters
     ----------
-    strip : Strip, path or str
-        The strip, opened with `open_strip`, or its path.
+    strip : Strip, path, str or iterable of WaveformBlock
+        The strip, opened with `open_strip`, or its path; or waveforms of yours (`WaveformBlock.from_samples`), which
+        are all looked at.
     waveforms : int, optional
         Waveforms to look at, spread over the strip; 8192 by default, fewer where they are long.
     divergence : float, optional
@@ -358,18 +359,23 @@ def survey(
     InputError
         Where the strip cannot be read or holds no waveform.
     """
-    from wavebatch.surveying.choose_chain import decide, read_sample  # `info` needs none of these
+    from wavebatch.surveying.choose_chain import read_sample  # `info` needs none of these
     from wavebatch.surveying.flat_ground import survey_angles
     from wavebatch.surveying.look import with_look
     from wavebatch.surveying.outgoing import compare_outgoing
     from wavebatch.surveying.survey import survey_blocks
 
-    if not isinstance(strip, Strip):
+    if isinstance(strip, Path | str):
         with open_strip(strip) as opened:
             return survey(
                 opened, waveforms=waveforms, divergence=divergence, find_divergence=find_divergence,
                 for_checks=for_checks,
             )  # fmt: skip
+    if not isinstance(strip, Strip):
+        if divergence is not None or find_divergence:
+            raise ConfigError("divergence: needs the points of a strip; leave it out for waveforms of your own")
+        sample = list(strip)
+        return _with_decisions(with_look(survey_blocks(sample), sample))
     sample = read_sample(strip.reader, strip.scan, waveforms)
     if not sample:
         path = strip.facts.path
@@ -382,6 +388,13 @@ def survey(
     elif find_divergence:
         with contextlib.suppress(InputError):  # coordinates that are not in metres
             found = survey_angles(strip.reader, strip.scan, found, None)
+    return _with_decisions(found)
+
+
+def _with_decisions(found: Survey) -> Survey:
+    """The survey with the decisions of the chain that `choose_chain` chooses by it."""
+    from wavebatch.surveying.choose_chain import decide
+
     chosen = decide(found)
     parts = {decision.part for decision in chosen}
     # What the scene needs but no chain has without further files follows the decisions of the chosen chain.

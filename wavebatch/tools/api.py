@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec
 
 from wavebatch.batch.job import StripJob, choose_columns, split_columns
-from wavebatch.batch.options import RunOptions, describe_options
+from wavebatch.batch.options import OPTIONS, RunOptions, describe_options
 from wavebatch.batch.run import BatchResult, check_outputs, plan_memory, run_batch
 from wavebatch.core.errors import ConfigError, InputError, nearest
 from wavebatch.files.cloud.point_filter import PointFilter
@@ -129,6 +129,9 @@ def run(
     ConfigError
         For wrong options, before anything starts.
     """
+    for name in options:
+        if name not in OPTIONS:
+            raise TypeError(f"run has no option {name}; {nearest(name, OPTIONS)}")
     return run_batch(*plan_run(strips, RunOptions(output, **options)), on_event)
 
 
