@@ -17,6 +17,31 @@ def lines(rng, number, *, apart=1.2, turned=0.0, jitter=0.03, n=16, sets=300):
     return (a * along - b * across).ravel(), (b * along + a * across).ravel(), np.repeat(np.arange(sets), n)
 
 
+def on_two_lines(u, v):
+    """Whether coordinates across one of 24 directions have hardly more than two values, or hardly any breadth."""
+    least = np.inf
+    for angle in np.pi * np.arange(24) / 24:
+        across = np.cos(angle) * (u - u.mean()) + np.sin(angle) * (v - v.mean())
+        variance = np.mean(across**2)
+        least = min(least, np.mean(across**4) / variance**2 - np.mean(across**3) ** 2 / variance**3 - 1)
+    narrow, long = np.linalg.eigvalsh(np.cov(u, v, bias=True))
+    return least < 0.1 or narrow < 0.01 * long
+
+
+def test_sets_on_two_lines_are_those_of_a_loop(rng):
+    n = rng.integers(4, 20, 400)
+    number, group = np.repeat(rng.integers(1, 5, 400), n), np.repeat(np.arange(400), n)
+    turned = np.repeat(rng.uniform(0, np.pi, 400), n)
+    along, across = rng.uniform(-1.5, 1.5, n.sum()), rng.integers(0, number) + rng.normal(0, 0.1, n.sum())
+    u, v = np.cos(turned) * along - np.sin(turned) * across, np.sin(turned) * along + np.cos(turned) * across
+    found = in_two_lines(u, v, group, 401)  # the last set has no point
+    expected = [on_two_lines(u[group == one], v[group == one]) for one in range(400)]
+    assert found.tolist() == [*expected, False]
+    assert 50 < sum(expected) < 350
+    with pytest.raises(ValueError, match="no set"):
+        in_two_lines(u, v, group, 399)
+
+
 @pytest.mark.parametrize("degrees", range(0, 180, 13))
 def test_two_lines_are_found_in_any_direction_and_three_are_not(rng, degrees):
     assert in_two_lines(*lines(rng, 2, turned=np.radians(degrees)), 300).mean() > 0.98

@@ -21,6 +21,7 @@
 #include "neighbours.h"
 #include "finish.h"
 #include "returns.h"
+#include "planes.h"
 #include "stack.h"
 #include "wdz.h"
 #include "packets.h"

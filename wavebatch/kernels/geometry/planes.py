@@ -20,11 +20,13 @@ direction in which the rays do not differ has an unknown slope, and says so.
 
 from __future__ import annotations
 
+import ctypes
 from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD
+from wavebatch.kernels.library import call
 
 OUTLYING = 4.0
 """Points further from the plane than this many robust standard deviations do not count."""
@@ -221,7 +223,7 @@ LEAST_BREADTH = 0.01
 """Variance across a set over that along it, below which it is one line: a tenth as broad as long. Three lines within
 1.5 m that are 10 cm apart are as broad. Through one line, noise makes a plane of any slope."""
 
-_POWERS = [(p, q) for order in (1, 2, 3, 4) for p in range(order, -1, -1) for q in [order - p]]
+_ACROSS = np.array([(np.cos(angle), np.sin(angle)) for angle in np.pi * np.arange(DIRECTIONS) / DIRECTIONS])
 
 
 def in_two_lines(u: np.ndarray, v: np.ndarray, group: np.ndarray, n: int) -> np.ndarray:
@@ -245,31 +247,13 @@ def in_two_lines(u: np.ndarray, v: np.ndarray, group: np.ndarray, n: int) -> np.
     Of the coordinates across any direction, kurtosis >= skewness^2 + 1, and equal only if they have two values (Pearson
     1916). The difference, their variety, is computed in DIRECTIONS; sums of products give it for all of them.
     """
-    number = np.maximum(np.bincount(group, minlength=n), 1).astype(np.float64)
-    u = u - (np.bincount(group, u, minlength=n) / number)[group]
-    v = v - (np.bincount(group, v, minlength=n) / number)[group]
-    powers = {1: (u, v), 2: (u * u, v * v)}
-    powers[3], powers[4] = (u * powers[2][0], v * powers[2][1]), (powers[2][0] ** 2, powers[2][1] ** 2)
-    moments = {}
-    for p, q in _POWERS[2:]:
-        product = powers[p][0] if p else powers[q][1]
-        if p and q:
-            product = product * powers[q][1]
-        moments[p, q] = np.bincount(group, product, minlength=n) / number
-    least = np.full(n, np.inf)
-    for angle in np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
-        a, b = np.cos(angle), np.sin(angle)
-        second = a * a * moments[2, 0] + 2 * a * b * moments[1, 1] + b * b * moments[0, 2]
-        third = a**3 * moments[3, 0] + b**3 * moments[0, 3]
-        third += 3 * a * b * (a * moments[2, 1] + b * moments[1, 2])
-        fourth = a**4 * moments[4, 0] + b**4 * moments[0, 4] + 6 * a * a * b * b * moments[2, 2]
-        fourth += 4 * a * b * (a * a * moments[3, 1] + b * b * moments[1, 3])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            variety = fourth / second**2 - third**2 / second**3 - 1.0
-        least = np.fmin(least, variety)
-    middle, half = 0.5 * (moments[2, 0] + moments[0, 2]), 0.5 * (moments[2, 0] - moments[0, 2])
-    longer = np.sqrt(half**2 + moments[1, 1] ** 2)
-    return (least < LEAST_VARIETY) | (middle - longer < LEAST_BREADTH * (middle + longer))
+    u, v, group = map(np.ascontiguousarray, (u, v, group), (np.float64, np.float64, np.int64))
+    if not len(u) == len(v) == len(group) or (len(group) and not 0 <= group.min() <= group.max() < n):
+        raise ValueError("points lie in no set")
+    found, (sets, points, directions) = np.empty(n, np.bool_), map(ctypes.c_int64, (n, len(u), DIRECTIONS))
+    limits = ctypes.c_double(LEAST_VARIETY), ctypes.c_double(LEAST_BREADTH)
+    call("find_two_lines", sets, points, u, v, group, directions, _ACROSS, *limits, found)
+    return found
 
 
 CUTS = 6
