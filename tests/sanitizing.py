@@ -34,7 +34,7 @@ from wavebatch.kernels.fit.decompose import (
 from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
 from wavebatch.kernels.library import Samples
-from wavebatch.kernels.signal.filters import find_maxima, quiet_levels
+from wavebatch.kernels.signal.filters import find_correlated, find_maxima, quiet_levels
 
 FLAGS = ("-g", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
 SETTINGS = {
@@ -192,6 +192,7 @@ def look_for(samples: Samples, candidates: Candidates, rng: np.random.Generator)
     for broad in (0.0, float(10 ** rng.uniform(-2, 3))):
         found = find_maxima(samples, float(rng.choice([0.0, 2.0])), float(10 ** rng.uniform(-2, 3)), broad, taps)
         assert len({len(column) for column in found}) == 1
+    assert len({len(column) for column in find_correlated(samples, 1.0, float(10 ** rng.uniform(-2, 3)), taps)}) == 1
     order = np.lexsort((candidates.time, candidates.waveform))
     ordered = Candidates(*(field[order] for field in candidates))
     tail = rng.integers(0, 2 * s, len(order)) if rng.random() < 0.5 else None

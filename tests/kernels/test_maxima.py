@@ -6,7 +6,7 @@ import pytest
 
 from wavebatch.kernels.fit.decompose import Candidates, cluster_candidates
 from wavebatch.kernels.library import Samples
-from wavebatch.kernels.signal.filters import find_maxima, gaussian_taps, quiet_levels
+from wavebatch.kernels.signal.filters import find_correlated, find_maxima, gaussian_taps, quiet_levels
 
 GAIN_121 = np.sqrt(6.0) / 4.0
 
@@ -70,6 +70,43 @@ def test_maxima(rng, broad, s):
                 height, place, wide = naive.log_parabola(smooth, int(at), ref)
                 wide = np.clip(min(wide, 0.5 * gap), 0.7 * ref, 4 * ref)
                 assert (a, t, w) == pytest.approx((height, place, wide), rel=1e-4)
+
+
+def naive_matches(y, missing, least, taps, ref):
+    """(time, height, width) of the maxima of one correlated waveform outside of its gaps."""
+    correlated = naive.correlate_symmetric(y, taps)
+    for _, at in naive.find_peaks(correlated[:, None], least):
+        time, height, three = at, correlated[at], correlated[max(at - 1, 0) : at + 2]
+        if len(three) == 3 and at > 0 and (three > 0).all():
+            a, b, c = np.log(three)
+            time = at + 0.5 * (a - c) / (a - 2 * b + c)
+            height = np.exp(b - 0.25 * (a - c) * (time - at))
+        here = int(np.clip(np.floor(time), 0, len(y) - 1))
+        after = min(here + 1, len(y) - 1)
+        inside = missing[here] and (missing[after] or time == here)
+        if not inside:
+            yield time, height, np.clip(naive.log_parabola(naive.smooth_121(y), at, ref)[2], 0.8 * ref, 2 * ref)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+@pytest.mark.parametrize("s", [2, 5, 64])
+def test_maxima_of_a_correlation(rng, kind, s):
+    samples, ref = record(rng, 80, s, kind), 1.7
+    samples = samples._replace(missing=rng.random((80, s)) < 0.1)
+    taps = gaussian_taps(ref)
+    waveform, time, height, width = find_correlated(samples, 6.0, ref, taps)
+    assert (np.diff(waveform) >= 0).all()
+    for i in range(80):
+        y, missing = (samples.counts[i] - samples.baseline[i]).astype(np.float32), samples.missing[i]
+        y[missing] = 0
+        for k in range(1, s - 1):
+            if missing[k] and not missing[k - 1] and not missing[k + 1]:
+                y[k] = np.float32(0.5) * (y[k - 1] + y[k + 1])
+        found = list(naive_matches(y, missing, 6.0 * samples.std[i], taps, ref)) if np.ptp(samples.counts[i]) else []
+        mine = np.stack([time, height, width], axis=1)[waveform == i]
+        assert len(mine) == len(found)
+        np.testing.assert_allclose(mine, np.reshape(found, (-1, 3)), rtol=1e-4, atol=1e-4)
+    assert len(waveform) > 20
 
 
 def test_an_echo_is_found_where_it_is(rng):

@@ -13,6 +13,7 @@ COMPILED = {
     "promise_echoes": ("promise_echoes", "naive_fit.propose"), "quiet_levels": ("quiet_levels", "naive.smooth_121"),
     "filter_rows": ("filter_symmetric", "naive.correlate_symmetric"),
     "find_maxima": ("find_maxima", "naive.find_peaks"),
+    "find_correlated": ("find_correlated", "test_maxima.naive_matches"),
     "group_candidates": ("cluster_candidates", "test_maxima.naive_clusters"), "exponentials": ("exp", "math.exp"),
     "logarithms": ("log", "math.log"), "solve_equations": ("solve", "np.linalg.solve"),
     "decode_packets": ("decode_packets", "naive_wdz.compress"),

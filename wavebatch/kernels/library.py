@@ -19,12 +19,12 @@ _POINTER = ctypes.c_void_p
 _BYTE: Any = ctypes.c_char.from_buffer  # of an array
 
 FUNCTIONS = (
-    "decompose_clusters", "promise_echoes", "quiet_levels", "filter_rows", "find_maxima", "group_candidates",
-    "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "describe_widths",
-    "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
-    "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes",
-    "match_returns", "weigh_fits", "finish_echoes",
-    "find_pulses", "find_nearest", "number_returns", "share_offsets", "find_around", "measure_lobes", "find_two_lines",
+    "decompose_clusters", "promise_echoes", "quiet_levels", "filter_rows", "find_maxima", "find_correlated",
+    "group_candidates", "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms",
+    "describe_widths", "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
+    "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes", "match_returns", "weigh_fits",
+    "finish_echoes", "find_pulses", "find_nearest", "number_returns", "share_offsets", "find_around",
+    "measure_lobes", "find_two_lines",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 

@@ -20,6 +20,7 @@
 #include "echoes.h"
 #include "neighbours.h"
 #include "finish.h"
+#include "matched.h"
 #include "returns.h"
 #include "planes.h"
 #include "stack.h"

@@ -192,15 +192,50 @@ def find_maxima(
     ----------
     Wagner et al. (2007), max-detection; docs/algorithms.md 1.1, 4.1.
     """
-    samples, n = samples.checked(), len(samples.counts)
-    half = np.ascontiguousarray(np.zeros(1) if taps is None else taps, np.float32)
+    taps = np.zeros(1) if taps is None else taps
+    return _list_maxima("find_maxima", samples.checked(), threshold, width, broad, taps)
+
+
+def find_correlated(
+    samples: Samples, threshold: float, width: float, taps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Local maxima of waveforms correlated with a pulse, outside of gaps, with starts for a fit.
+
+    Parameters
+    ----------
+    samples, width
+        As for `find_maxima`.
+    threshold : float
+        Least height of the correlation [noise of one sample].
+    taps : float (k,)
+        Half of the pulse, the centre first.
+
+    Returns
+    -------
+    waveform : int64 (m,)
+    time, amplitude, width : float64 (m,), samples, units of the correlation, samples
+        From a parabola through the logarithms of three correlations; the width, 0.8 to 2 times the given one, from five
+        samples.
+
+    References
+    ----------
+    docs/algorithms.md 1.1 (4).
+    """
+    return _list_maxima("find_correlated", samples.checked(finite=False), threshold, width, 0.0, taps)
+
+
+def _list_maxima(
+    name: str, samples: Samples, threshold: float, width: float, broad: float, taps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What a function of the library finds, called again where there was too little room."""
+    n, half = len(samples.counts), np.ascontiguousarray(taps, np.float32)
     detector = library.Detector(threshold, width, broad, place(half, np.float32), len(half) - 1)
     room, done, parts = 2 * n + samples.counts.shape[1], 0, []
     while done < n:
         columns = np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room)
         out, found = library.CCandidates(room, *map(library.address, columns)), ctypes.c_int64()
         sizes = ctypes.c_int64(n), detector, ctypes.c_int64(done)
-        done = call("find_maxima", samples.as_block(), *sizes, out, ctypes.byref(found))
+        done = call(name, samples.as_block(), *sizes, out, ctypes.byref(found))
         parts.append([column[: found.value] for column in columns])
         room *= 2
     waveform, amplitude, time, wide = map(np.concatenate, zip(*parts, strict=True)) if parts else np.empty((4, 0))

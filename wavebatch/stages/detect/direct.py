@@ -248,6 +248,7 @@ def choose_smoothing(ref: float) -> tuple[float, np.ndarray | None, float]:
 
 
 def _correlate(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float) -> Searched:
+    """What `matched_filter` searches: its kernel takes one waveform after the other."""
     taps, signal = filters.gaussian_taps(system.sigma_ref / block.spacing), signal_above(block, noise)
     energy = filters.filter_energy(taps)
     least = np.float32(threshold * np.sqrt(energy)) * noise.std
@@ -275,11 +276,11 @@ def matched_filter(
     docs/algorithms.md 1.1 (4), 1.3, 4.1.
     """
     ref = system.sigma_ref / block.spacing
-    found = _correlate(block, noise, system, threshold=threshold)
-    waveform, sample = find_peaks(found.values, found.least)
-    time, height = filters.refine_peaks(found.values, waveform, sample)
-    _, _, width = estimate_starts(smooth_121(found.signal), waveform, sample, ref)
-    return make_table(block, waveform, time, height / found.unit, np.clip(width, 0.8 * ref, 2.0 * ref))
+    taps = filters.gaussian_taps(ref)
+    energy = filters.filter_energy(taps)
+    waveform, *found = filters.find_correlated(samples_of(block, noise), threshold * np.sqrt(energy), ref, taps)
+    time, height, width = found
+    return EchoTable.build(waveform, time * block.spacing, height / energy, width * block.spacing)
 
 
 def _curve(
