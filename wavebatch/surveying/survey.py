@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.order import median, quantile
+from wavebatch.core.order import median
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.toml_file import list_entries
@@ -52,7 +51,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
 from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
-from wavebatch.surveying.systems.figures import Figures
+from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
 from wavebatch.surveying.systems.known_systems import guess_width, list_known, share_repeated
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
@@ -109,7 +108,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
     raw = main
     main, plain = clean_sample(raw, begin)
     found = _survey(main, plain, learn=learn)
-    _note_counts(found.figures, raw)
+    note_counts(found.figures, raw)
     found.figures.descriptors_pooled = float(len(members))
     if others:
         # What each of the others records otherwise, and the scene that all see.
@@ -123,7 +122,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
                 reason = strange or "its bits, spacing, gain, offset, level, noise or pulse differ from the main one's"
                 named.append(Decision(f"digitizer {block.digitizer.index}", True, reason))
             counts.append(len(block))
-            scenes.append(_describe(block, own, decompose_sample(block, own), Figures()))
+            scenes.append(describe_scene(Figures(), block, own, decompose_sample(block, own), MIN_SNR))
         names = [one.field for one in list_entries(Figures) if one.key.averaged]
         shares: dict[str, Any] = {
             name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names
@@ -202,14 +201,8 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
     if not len(block):
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
     found = _survey(*clean_sample(block, measure_begin(block)), learn=learn)
-    _note_counts(found.figures, block)
+    note_counts(found.figures, block)
     return found
-
-
-def _note_counts(figures: Figures, block: WaveformBlock) -> None:
-    """Add the range of the counts as they were recorded: a block that was cleaned may leave the digitizer's range."""
-    figures.least_count = float(block.samples.min(initial=block.digitizer.max_count))
-    figures.largest_count = float(block.samples.max(initial=0))
 
 
 def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
@@ -299,7 +292,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     widths = LevelWidths(scatter=scatter)
     system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)
     system = measure_skew(part, system, echoes) if learn else system
-    figures = _describe(part, system, echoes, figures)
+    figures = describe_scene(figures, part, system, echoes, MIN_SNR)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
     if lowered:
         reason = f"noise is {system.noise.std:.2f} DN without them, {lowered:.2f} with them; the echoes found "
@@ -310,34 +303,6 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         reason = f"every strong echo has one of up to {100 * share:.1f} % of it at {lags}: echoes there must be higher"
         decisions = (*decisions, Decision("part of the pulse", True, reason))
     return Survey(system, len(block), figures, decisions, candidates)
-
-
-def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figures: Figures) -> Figures:
-    """The figures with samples, shares and amplitudes of the scene."""
-    n = len(block)
-    number = echoes.count(n)
-    overlapped = np.zeros(n, bool)
-    overlapped[echoes.waveform[(echoes.flags & int(EchoFlag.OVERLAPPED)) != 0]] = True
-    saturated = 0.0
-    if system.saturation is not None:
-        saturated = float((block.samples >= system.saturation).any(axis=1).mean())
-    narrow = (number[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise.std)
-    deviation = (echoes.sigma - system.sigma_ref) / np.maximum(echoes.sigma_err, 1e-6)
-    return replace(
-        figures,
-        spacing_ns=block.spacing,
-        n_samples=float(block.samples.shape[1]),
-        bits=float(block.digitizer.bits),
-        inverted=float(block.digitizer.inverted),
-        empty_share=float((number == 0).mean()),
-        single_share=float((number == 1).mean()),
-        overlapped_share=float(overlapped.mean()),
-        echoes_per_waveform=float(number.mean()),
-        amplitude_50=float(median(echoes.amplitude)) if len(echoes) else 0.0,
-        amplitude_99=quantile(echoes.amplitude, 0.99) if len(echoes) else 0.0,
-        saturated_share=saturated,
-        system_width_share=float((np.abs(deviation[narrow]) < 3).mean()) if narrow.any() else 0.0,
-    )
 
 
 def _decide(

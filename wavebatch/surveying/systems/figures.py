@@ -1,8 +1,9 @@
 """The tables [figures] and [system] of a SYSTEM.toml: what a survey measured, and the system pulse as plain numbers.
 
 Figures: echoes and pulse models, the scene, and what strips of the flight record. `survey` fills them in, decisions and
-reports are made from them, and `survey_result` keeps them. A field whose Key says how it is `shown` is a line of
-`wavebatch survey` too. Files of earlier versions lack figures and have others, so each may be missing.
+reports are made from them, and `survey_result` keeps them. A figure of counts or echoes is one field and one line of
+`note_counts` or `describe_scene`; a field whose Key says how it is `shown` is a line of `wavebatch survey` too. Files
+of earlier versions lack figures and have others, so each may be missing.
 
 System: `survey_result` writes and reads whole files with it, `known_systems` the pulses that are shipped. Keys, ranges
 and comments are those of the fields of SystemPulse. Before you change it: every number must come back to the last bit.
@@ -15,11 +16,15 @@ from collections.abc import Mapping
 from dataclasses import field, replace
 from typing import Annotated, Any
 
+import numpy as np
+
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import changeable, frozen
+from wavebatch.core.order import median, quantile
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.toml_file import TomlTable, check_number, describe_record, list_comments, read_record
 
 MOST_FIGURE = 1e30
@@ -146,6 +151,42 @@ class Figures:
             return ""
         most = "up to " * ((self.descriptors_pooled or 0.0) > 1.0)
         return f"{most}{self.n_samples:.0f} of {self.bits:.0f} bits, {self.spacing_ns:g} ns apart"
+
+
+def note_counts(figures: Figures, block: WaveformBlock) -> None:
+    """Add the range of the counts as they were recorded: a block that was cleaned may leave the digitizer's range."""
+    figures.least_count = float(block.samples.min(initial=block.digitizer.max_count))
+    figures.largest_count = float(block.samples.max(initial=0))
+
+
+def describe_scene(
+    figures: Figures, block: WaveformBlock, system: SystemPulse, echoes: EchoTable, clear: float
+) -> Figures:
+    """The figures with samples, shares and amplitudes of the scene; clear: amplitude over noise of a clear echo."""
+    n = len(block)
+    number = echoes.count(n)
+    overlapped = np.zeros(n, bool)
+    overlapped[echoes.waveform[(echoes.flags & int(EchoFlag.OVERLAPPED)) != 0]] = True
+    saturated = 0.0
+    if system.saturation is not None:
+        saturated = float((block.samples >= system.saturation).any(axis=1).mean())
+    narrow = (number[echoes.waveform] == 1) & (echoes.amplitude > clear * system.noise.std)
+    deviation = (echoes.sigma - system.sigma_ref) / np.maximum(echoes.sigma_err, 1e-6)
+    return replace(
+        figures,
+        spacing_ns=block.spacing,
+        n_samples=float(block.samples.shape[1]),
+        bits=float(block.digitizer.bits),
+        inverted=float(block.digitizer.inverted),
+        empty_share=float((number == 0).mean()),
+        single_share=float((number == 1).mean()),
+        overlapped_share=float(overlapped.mean()),
+        echoes_per_waveform=float(number.mean()),
+        amplitude_50=float(median(echoes.amplitude)) if len(echoes) else 0.0,
+        amplitude_99=quantile(echoes.amplitude, 0.99) if len(echoes) else 0.0,
+        saturated_share=saturated,
+        system_width_share=float((np.abs(deviation[narrow]) < 3).mean()) if narrow.any() else 0.0,
+    )
 
 
 def describe_figures(figures: Figures) -> dict[str, float]:
