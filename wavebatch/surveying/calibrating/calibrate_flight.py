@@ -203,7 +203,7 @@ class Trend(NamedTuple):
 
 def fit_swath(
     ties: adjust.Ties, anchors: adjust.Anchors, seen: np.ndarray
-) -> tuple[adjust.Adjustment, tuple[float, ...], float | None]:
+) -> tuple[adjust.Adjustment, tuple[float, ...], float, float | None]:
     """Adjust the constants with a term over the scan angle.
 
     Parameters
@@ -219,6 +219,8 @@ def fit_swath(
         With the constants straight below the sensor.
     swath : (float, float, float, float)
         As `Radiometry.swath`.
+    edge : float
+        Error of the term at the edge of the swath, relative: constants near it are not known better.
     open_error : float or None
         Error of the constants, relative, where the strips leave open whether light falls from side to side: as if that
         made their constants differ, or stood for what falls to both edges. None where they tell it.
@@ -247,7 +249,7 @@ def fit_swath(
             "%; give strips that overlap by a third or more, or leave --scan-angle out"
         )
     if odd:
-        return adjusted, (most, *map(float, adjusted.terms)), None
+        return adjusted, (most, *map(float, adjusted.terms)), edge, None
     # The error of the constants if they differ because each strip was seen from another side, or if the light falls
     # from side to side and not to both edges, where that explains the overlaps nearly as well.
     other = adjust.adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
@@ -261,7 +263,7 @@ def fit_swath(
     apart = apart + swath_columns(grid, 1.0) @ [*adjusted.terms, -other.terms[0]]
     alike = other.scatter < max(LEAST_SPREAD, adjusted.scatter / EXPLAINED)
     error = max(drift, float(np.sqrt(np.mean(apart**2))) if alike else 0.0)
-    return adjusted, (most, *map(float, adjusted.terms), 0.0), error
+    return adjusted, (most, *map(float, adjusted.terms), 0.0), edge, error
 
 
 def find_trend(
@@ -401,14 +403,14 @@ def calibrate_flight(
             seen[number] = source.strip.seen[source.channel]
     anchors = adjust.Anchors(value, error)
     swath: tuple[float, ...] = ()
-    open_error = None
+    edge, open_error = 0.0, None
     if options.scan_angle:
-        adjusted, swath, open_error = fit_swath(ties, anchors, seen)
+        adjusted, swath, edge, open_error = fit_swath(ties, anchors, seen)
         ties = replace(ties, value=ties.value + swath_columns(ties.view["angle"], swath[0]) @ swath[1:])
         anchors = replace(anchors, value=anchors.value - swath_columns(seen["angle"], swath[0]) @ swath[1:])
     else:
         adjusted = adjust.adjust_constants(ties, anchors)
-    calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath)
+    calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath).widened(edge)
     names = [source.name for source in sources]
     pairs = tuple(adjust.compare_pairs(ties, adjusted, names))
     lost = []

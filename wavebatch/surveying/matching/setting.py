@@ -252,9 +252,11 @@ def compare_ground(
         return None
     # Warming up, or failing for a time, moves parts of the strip.
     parts = np.array_split(off[np.argsort(time, kind="stable")], len(np.unique(near[rows])) // LEAST_COMMON)
-    doubt = MEDIAN_ERROR * robust_std(off) * (len(parts) / len(off)) ** 0.5
-    moved = float(np.std([np.median(part) for part in parts]))
-    uneven = weigh_change(moved, float(np.hypot(doubt, SAME_GROUND)), chance=chance)._replace(is_uneven=True)
+    middles = [float(np.sort(part)[len(part) // 4 : -(len(part) // 4)].mean()) for part in parts]
+    rest = np.concatenate([part - middle for part, middle in zip(parts, middles, strict=True)])
+    rest = np.clip(rest, -BORDER * robust_std(rest), BORDER * robust_std(rest))
+    doubt = float(np.hypot(MEDIAN_ERROR * np.std(rest) * (len(parts) / len(off)) ** 0.5, SAME_GROUND))
+    uneven = weigh_change(float(np.std(middles)), doubt, chance=chance)._replace(is_uneven=True)
     # Neighbours on two sides of a field's border say nothing.
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
     off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
