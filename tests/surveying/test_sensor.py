@@ -312,6 +312,23 @@ def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_pa
             find(strip, trajectory=trajectory)
 
 
+@pytest.mark.parametrize(("above", "share"), [(20.0, 0.5), (20.0, 0.2), (20.0, 0.08), (5.0, 0.3), (0.0, 0.5)])
+def test_errors_hold_two_sensors_above_each_other(monkeypatch, tmp_path, above, share):
+    """Their rays hardly miss a path between them: ranges were 10 m off with errors of 1 m, or 20 m with .00."""
+    second = np.random.default_rng(5).random(8000) < share
+    lift = np.outer(second, [0.0, 0.0, above])
+    monkeypatch.setattr(facet_strips, "path_of", lambda sensor, seconds: path_of(sensor, seconds) + lift)
+    flight = Sensor(rate=5000.0, n_samples=40)
+    found = find(write_strip(tmp_path / "a.las", [Facet(0.3)], flight, 8000))
+    if above == 20.0 and share > 0.1:
+        assert found.kind == "none" and dict(found.facts)["do_not_meet_deg"]
+        return
+    seconds = np.arange(8000) / flight.rate
+    off = found.trajectory.at(START + seconds) - path_of(flight, seconds) - lift - [EAST, NORTH, 0.0]
+    high = np.sqrt(np.nanmean(off[:, 2] ** 2))
+    assert 0.7 * high < found.error < 1.5 * high if above else found.error < 0.1
+
+
 def test_a_strip_that_is_sorted_by_place_has_the_sensor_at_all_times(tmp_path, edit_points):
     """Points of tiles, one tile after the other: each place of the file has rays of a short time."""
     flight, pulses = Sensor(rate=1000.0, n_samples=40), 40_000
