@@ -183,7 +183,7 @@ def _choose_radius(xyz: np.ndarray) -> float:
     number = LEAST_NEIGHBOURS * 3 // 2
     if len(xyz) <= number:
         return RADII[0]
-    some, around = xyz[:: max(len(xyz) // 500, 1)], Surroundings(xyz)
+    some, around = xyz[:: max(len(xyz) // 500, 1)], Surroundings(xyz, 2 * RADII[0])
     # Distance within which nine tenths of some points have so many points, with themselves; far beyond `reach` where
     # that is not enough.
     reach, needed = 0.5 * RADII[0], np.inf

@@ -226,11 +226,14 @@ def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
 
 
 class Surroundings:
-    """Points (m, 3) [m], finite, that may be neighbours of others. Sums run in the order of these points."""
+    """Points (m, 3) [m], finite, that may be neighbours of others. Sums run in the order of these points.
 
-    def __init__(self, xyz: np.ndarray) -> None:
+    They are sorted into cells by the first radius that is asked for; those of `widest` [m] serve down to half of it.
+    """
+
+    def __init__(self, xyz: np.ndarray, widest: float = 0.0) -> None:
         self._xyz = np.ascontiguousarray(xyz, np.float64)
-        self._side = 0.0
+        self._side, self._widest = 0.0, widest * (1 + 1e-6)
 
     def _number_cells(self, points: np.ndarray) -> np.ndarray:
         """Cells of points, counted along x, then y, then z; what is far away is in the outermost ones."""
@@ -258,7 +261,7 @@ class Surroundings:
             return np.empty(0, np.int64), np.empty((0, 3))
         points, side = np.ascontiguousarray(points, np.float64), radius * (1 + 1e-6)
         if not side <= self._side <= 2 * side:  # larger cells serve too
-            self._side = side
+            self._side = self._widest if side <= self._widest <= 2 * side else side
             cell = self._number_cells(self._xyz)
             self._order = np.argsort(cell)
             self._cell, self._sorted = cell[self._order], self._xyz[self._order]

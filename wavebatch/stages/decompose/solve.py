@@ -142,12 +142,13 @@ def _explain_tails(
     waveform, time, amplitude, _ = candidates
     expected = np.zeros(len(waveform))
     for step in range(1, min(MOST_JOINED, len(waveform))):
-        same = waveform[step:] == waveform[:-step]
-        if not same.any():
+        first = np.flatnonzero(waveform[step:] == waveform[:-step])
+        if not len(first):
             break
-        lag = time[step:] - time[:-step]
-        expected[step:] += np.where(same, amplitude[:-step] * tail_at(tail, lag), 0.0)
-        expected[:-step] += np.where(same, amplitude[step:] * tail_at(tail, -lag), 0.0)
+        later = first + step
+        lag = time[later] - time[first]
+        expected[later] += amplitude[first] * tail_at(tail, lag)
+        expected[first] += amplitude[later] * tail_at(tail, -lag)
     std = noise.std[waveform]
     keep = amplitude - expected > 2.2 * std + 0.5 * expected
     # A tail below the noise of what found a candidate does not explain it, however broad the pulse is.
