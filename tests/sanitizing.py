@@ -215,7 +215,8 @@ def judge(samples: Samples, echoes: Candidates, rng: np.random.Generator) -> Non
     assert (neighbours.weigh_fits(table, law, others=True)[0] >= 1).all()
     flagging = Flagging(0.5, 0.5 * s, width, width, level, 1.5, 0.1)
     faint = Faintness(0.1, 0, 9, True, level, 0.1, curve, 1, 5, 9, 2, 2, 2)
-    steps = neighbours.Finishing(0.5, width, width, rng.choice([0.0, 1.0]), faint, law, True, True, flagging, faint)
+    error = rng.choice([0.0, 1.0])
+    steps = neighbours.Finishing(True, 0.5, width, width, error, faint, law, True, True, flagging, faint)
     levels = samples._replace(baseline=samples.std)
     assert len(neighbours.finish_echoes(table.columns(), np.arange(m), levels, steps, np.ones((m, 4)))[1]) <= m
 

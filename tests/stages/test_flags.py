@@ -189,6 +189,16 @@ def test_colour_and_misfits_of_echoes_that_are_left_are_given_by_their_rows(tabl
     np.testing.assert_allclose(grown, expected, rtol=1e-6)
 
 
+def test_echoes_are_sorted_and_those_of_one_place_keep_their_order(table, rng):
+    table = replace(table, time=np.round(table.time, 0))
+    mixed = table.take(np.argsort(np.arange(len(table)) + rng.integers(0, 9, len(table)), kind="stable"))
+    order = np.lexsort((mixed.time, mixed.waveform))
+    found, row, _ = finish(mixed, sort=True)
+    assert row.tolist() == order.tolist() != list(range(len(table)))
+    for name, values in mixed.take(order).columns().items():
+        np.testing.assert_array_equal(getattr(found, name), values)
+
+
 def test_echoes_inside_of_gaps_are_left_out(table):
     missing = np.zeros((N, S), bool)
     missing[::3, 25:33] = missing[1::3, :4] = missing[1::3, 40:] = missing[2::9, 57:] = True

@@ -246,6 +246,7 @@ class CFinishing(ctypes.Structure):
     """`Finishing` of kernels/c/finish.h."""
 
     _fields_ = [
+        *_fields(ctypes.c_int64, "sort"),
         *_fields(ctypes.c_double, "gaps twins overlap unresolved"),
         *_fields(_POINTER, "unproven unexplained"),
         *_fields(ctypes.c_int64, "others lone"),

@@ -7,6 +7,7 @@
 enum { FLAG_RINGING = 64, FLAG_MERGED = 4096 };
 
 typedef struct { /* steps in this order; what is 0 or NULL is left out */
+    int64_t sort;                              /* by waveform, then time: as fits give them, few are out of order */
     double gaps;                               /* time between two samples: echoes inside of gaps are left out */
     double twins;                              /* widths below which two separate fits are one echo */
     double overlap, unresolved;                /* widths, and errors of their distance, below which two of one fit are one */
@@ -22,20 +23,41 @@ static Table as_table(const Kept *e, int64_t m) {
     return (Table){m, e->waveform, e->time, e->amplitude, e->sigma, e->time_err, e->amplitude_err, e->sigma_err, e->residual, e->flags};
 }
 
+typedef struct { int32_t waveform; double time; float floats[7]; uint16_t flags; int64_t row; } OneEcho;
+
+static OneEcho get_echo(const Kept *e, int64_t i) {
+    return (OneEcho){e->waveform[i], e->time[i], {e->amplitude[i], e->sigma[i], e->time_err[i], e->amplitude_err[i], e->sigma_err[i],
+        e->relative_energy_err[i], e->residual[i]}, e->flags[i], e->row[i]};
+}
+
+static void put_echo(const Kept *e, int64_t i, OneEcho one) {
+    float *const columns[] = {e->amplitude, e->sigma, e->time_err, e->amplitude_err, e->sigma_err, e->relative_energy_err, e->residual};
+    e->waveform[i] = one.waveform;
+    e->time[i] = one.time;
+    for (int k = 0; k < 7; k++) columns[k][i] = one.floats[k];
+    e->flags[i] = one.flags;
+    e->row[i] = one.row;
+}
+
+/* Each echo moves before those that it precedes: echoes of one place keep their order. */
+static void sort_echoes(const Kept *e, int64_t m) {
+    for (int64_t i = 1; i < m; i++) {
+        int64_t to = i;
+        while (to && (e->waveform[to - 1] > e->waveform[i] || (e->waveform[to - 1] == e->waveform[i] && e->time[to - 1] > e->time[i]))) to--;
+        if (to == i) continue;
+        const OneEcho one = get_echo(e, i);
+        for (int64_t k = i; k > to; k--) put_echo(e, k, get_echo(e, k - 1));
+        put_echo(e, to, one);
+    }
+}
+
 /* Keeps the echoes that are not marked, in their order, and returns their number. */
 static int64_t leave_out(const Kept *e, int64_t m, const uint8_t *marked) {
-    float *const columns[] = {e->amplitude, e->sigma, e->time_err, e->amplitude_err, e->sigma_err, e->relative_energy_err, e->residual};
     const uint8_t *const first = memchr(marked, 1, m);
     if (!first) return m;
     int64_t kept = first - marked;
-    for (int64_t i = kept; i < m; i++) {
-        if (marked[i]) continue;
-        e->waveform[kept] = e->waveform[i];
-        e->time[kept] = e->time[i];
-        for (int k = 0; k < 7; k++) columns[k][kept] = columns[k][i];
-        e->flags[kept] = e->flags[i];
-        e->row[kept++] = e->row[i];
-    }
+    for (int64_t i = kept; i < m; i++)
+        if (!marked[i]) put_echo(e, kept++, get_echo(e, i));
     return kept;
 }
 
@@ -90,13 +112,14 @@ static void clear_lone(const Kept *e, int64_t m) {
     }
 }
 
-/* m echoes sorted by waveform, then time. `grown`, or NULL: factors on the errors of amplitudes, up to 1, by how much they grew
+/* m echoes, sorted or to be sorted by waveform, then time. `grown`, or NULL: factors on the errors of amplitudes, up to 1, by how much they grew
    here. Returns how many stay. */
 EXPORT int64_t finish_echoes(int64_t m, const Kept *e, const Block *b, const Finishing *f, float *grown) {
     double *room = malloc((2 * m + 1) * sizeof *room), *variance = room + m;
     uint8_t *marked = (uint8_t *)room;
     int64_t *pair = (int64_t *)variance;
     if (!room) return -1;
+    if (f->sort) sort_echoes(e, m);
     if (f->gaps > 0 && b->missing) {           /* an echo between two recorded samples is known, however narrow it is */
         for (int64_t i = 0; i < m; i++) {
             const float half = 0.5f * e->sigma[i] / (float)f->gaps;

@@ -114,6 +114,8 @@ def weigh_fits(echoes: Any, law: Unexplained, *, others: bool) -> tuple[np.ndarr
 class Finishing(NamedTuple):
     """Steps from echoes of fits to a table, in their order; what has its default is left out."""
 
+    sort: bool = False
+    """Echoes are sorted by waveform, then time; few may be far from their place."""
     gaps: float = 0.0
     """Time between two samples [ns]: echoes inside of gaps are left out."""
     twins: float = 0.0
@@ -148,7 +150,7 @@ def finish_echoes(
     Parameters
     ----------
     columns : dict of arrays (m,)
-        The core columns of an EchoTable, sorted by waveform, then time.
+        The core columns of an EchoTable, sorted by waveform, then time, unless `sort` is asked for.
     row : int64 (m,)
         A number of each echo, for other columns.
     samples : Samples

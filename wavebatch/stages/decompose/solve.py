@@ -14,7 +14,6 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import find_order
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit import decompose
 from wavebatch.kernels.fit.neighbours import finish_echoes
@@ -438,12 +437,9 @@ def describe_solution(
     factors = error_factors(fitted, spacing, widths, level_err)
     whole = whole_pulse(settings.shape, limits, widths)
     columns, row = decompose.keep_echoes(clusters, solution, whole, factors, noise.std, spacing, length, significance)
-    order = find_order(columns["waveform"], columns["time"])
-    if order is not None:
-        columns, row = {name: values[order] for name, values in columns.items()}, row[order]
     proves = bool(settings.shape.components) or not system.components
     steps = flagging(block, system)._replace(
-        gaps=spacing, twins=TWINS, overlap=OVERLAP, unresolved=UNRESOLVED, lone=True,
+        sort=True, gaps=spacing, twins=TWINS, overlap=OVERLAP, unresolved=UNRESOLVED, lone=True,
         unproven=unproven(system, clip_level(block, system) - system.noise.baseline) if proves else None,
         unexplained=unexplained(system, spacing), others=leave_beside(system),
     )  # fmt: skip
