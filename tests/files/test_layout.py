@@ -65,7 +65,8 @@ def test_geotiff_cannot_be_promoted_but_wkt_can(tmp_path):
     with pytest.raises(InputError, match="geo.las: its CRS is given by GeoTIFF keys only, point formats 6 to 10 need"):
         plan_output(tmp_path / "geo.las", [], point_format=6)
     old = plan_output(tmp_path / "geo.las", [])
-    assert (old.version, old.point_format) == ((1, 4), 1) and "--point-format 6 tries" in old.notes[0]
+    assert (old.version, old.point_format) == ((1, 4), 1)
+    assert "to try that format, give --point-format 6" in old.notes[0]
     for name in ("both", "none"):
         for wanted in (None, 6):
             layout = plan_output(tmp_path / f"{name}.las", [], point_format=wanted)

@@ -12,7 +12,7 @@ from helpers_scenes import make_scene
 
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import parse_chain
-from wavebatch.surveying.choose_chain import COSTS, Request, make_choice, widest
+from wavebatch.surveying.choose_chain import COSTS, Request, make_choice, widest_chain
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 
 pytestmark = pytest.mark.kept_surveys
@@ -209,7 +209,7 @@ def test_a_choice_travels_between_processes(strips):
 
     for request in (Request(auto=True), Request(tolerance=0.1)):
         with StripReader(strips / "flat.las") as reader, reader.scan() as scan:
-            choice = make_choice(reader, scan, widest(request), request)
+            choice = make_choice(reader, scan, widest_chain(request), request)
         again = pickle.loads(pickle.dumps(choice))
         assert again.survey == choice.survey and again.decisions == choice.decisions
         assert again.predictions == choice.predictions

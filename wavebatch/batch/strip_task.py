@@ -50,7 +50,7 @@ class StripTask:
     job : StripJob
     options : RunOptions
     alone : bool
-        Whether no other strip may be under way: it is tried again after a worker process died.
+        Whether it runs while no other strip does: a worker process died of it, and it is tried once more.
     """
 
     facts: StripFacts
@@ -211,7 +211,7 @@ class StripTask:
         self._report += report + RunReport(timing={"write": Seconds.now() - start})
 
     def _take_rows(self, made: Any) -> None:
-        """Rows of LAS are written at once, those of LAZ wait until they fill a chunk; a second pass takes its part."""
+        """Rows of LAS are written at once, those of LAZ wait to fill a chunk. A second pass keeps its results."""
         if self._second is None:
             self.written += 1
         else:

@@ -247,7 +247,7 @@ def list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     """The figures of a comparison; document: of `Comparison.to_json`, or of `Matchup.to_json`."""
     for name, value in document.items():
         if name in _TABLES:
-            # Echoes without a partner by return number, amplitude, flags and company.
+            # Echoes without a partner: by return number, amplitude, flags, and other echoes of their pulse.
             title, side = _TABLES[name]
             for kind, classes in value.items():
                 for each, (alone, of) in classes.items():

@@ -44,12 +44,12 @@ def frozen(kind: type | None = None, /, *, eq: bool = True, order: bool = False)
     bases = [vars(base)["__dataclass_params__"] for base in kind.__mro__[1:] if "__dataclass_params__" in vars(base)]
     bases = [base for base in bases if base.frozen]
     for base in bases:
-        base.frozen = False  # `dataclass` would write the methods that this class has, or refuse it
+        base.frozen = False  # else `dataclass` refuses a class that is not frozen, or writes methods into a frozen one
     made: Any = dataclass(init=False, repr=False, eq=False, slots=True)(kind)
     for one in (*bases, made.__dataclass_params__):
         one.frozen = True
     if len(fields(made)) < len(made.__dataclass_fields__) or not all(one.init and one.repr for one in fields(made)):
-        raise TypeError(f"{kind.__name__} has a field that is not of its objects, or that is hidden: use dataclass")
+        raise TypeError(f"{kind.__name__} has a ClassVar, an InitVar, or a field without init or repr: use dataclass")
     return made
 
 
@@ -61,7 +61,7 @@ def changeable(kind: type[T]) -> type[T]:
 
 
 def _share(kind: type, methods: dict[str, Any]) -> None:
-    """Give a class these methods, but for those that it or its bases have."""
+    """Give a class these methods, except those that it or one of its bases has."""
     for name, method in methods.items():
         if getattr(kind, name, None) is getattr(object, name, None):
             setattr(kind, name, method)
@@ -91,7 +91,7 @@ def _init(self: Any, *values: Any, **named: Any) -> None:
 
 
 _SHOWN = 100
-"""Characters of a field that a prompt shows: the whole of one long array or table hides all others."""
+"""Characters of a field that a prompt shows: one long array would hide all other fields."""
 
 
 def _values(self: Any) -> tuple[Any, ...]:

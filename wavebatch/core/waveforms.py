@@ -104,7 +104,7 @@ class LevelWidths:
         None
     )
     """Standard deviation of `variance` [ns2]; None where it was not measured, infinite where surfaces of known slope
-    were sought and not found, so that widths mean no angle.
+    were sought and not found: widths give no angle then.
     """
     scatter: Annotated[
         float, Range(0.0, 1e4), Key("width_scatter_ns", "of echo widths beyond the errors of their fits")
@@ -149,7 +149,7 @@ class Radiometry:
     returns: float = 0.0
     """Standard deviation of the vendor's returns along the ray [m], which echoes are placed by."""
     phase: float = 0.0
-    """Root mean square of what locations of returns differ from echoes [m]: the error of echoes without a return."""
+    """Root mean square difference of return locations and echoes [m]: the error of echoes without a return."""
 
 
 def angle_to_vertical(direction: np.ndarray) -> np.ndarray:

@@ -72,8 +72,8 @@ def _decide_growth(survey: Survey) -> Decision:
         return Decision(Part.GROWTH, True, "the survey does not say how many echoes overlap")
     share = min(overlapped * survey.waveforms / filled, 1.0)
     number = share * filled
-    # Upper limit of the share: two standard deviations of the count above it, and at least six waveforms more, because
-    # a small sample without overlaps proves little: with four, tiles of 1,000 waveforms grew or not by one pair.
+    # Upper limit of the share: the count, two of its standard deviations, and six waveforms at least, because a small
+    # sample without overlaps proves little. With four, one pair decided whether a tile of 1,000 waveforms has growth.
     most = min((number + 4 + 2 * math.sqrt(number + 1)) / filled, 1.0)
     found = f"of the {filled:.0f} waveforms with echoes {100 * share:.2f} % hold overlapping ones"
     limit = f"at most {100 * most:.2f} % by this sample, the limit is {100 * LOST:g} %"
@@ -112,11 +112,6 @@ def chain_text(survey: Survey) -> str:
 def _comment(decision: Decision) -> str:
     reason = " ".join(decision.reason.split())
     return f"# {decision.part}: {'yes' if decision.needed else 'no'}: {reason}"
-
-
-def widest_chain() -> Chain:
-    """Return the automatic chain with all parts: its columns are those that a user can ask for."""
-    return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0))
 
 
 COSTS = ("fast", "balanced", "accurate")
@@ -172,9 +167,11 @@ _USERS = "user"
 """Name of the user's chain among the predictions; shipped chains have theirs."""
 
 
-def widest(request: Request) -> Chain:
-    """Return a chain that has every column of any chain that may be chosen."""
-    return load_profile(COSTS[-1]) if request.tolerance is not None else widest_chain()
+def widest_chain(request: Request | None = None) -> Chain:
+    """Return a chain that has every column of any chain that may be chosen; by default the survey chooses it."""
+    if request is not None and request.tolerance is not None:
+        return load_profile(COSTS[-1])
+    return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0))
 
 
 def read_sample(reader: StripReader, scan: StripScan, waveforms: int | None = None) -> list[WaveformBlock]:

@@ -25,7 +25,7 @@ from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages.chain import Chain, list_profiles, load_chain_file, load_profile
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
 from wavebatch.surveying.calibration import check_attenuation, needs_sensor
-from wavebatch.surveying.choose_chain import Request, choose_chain, widest
+from wavebatch.surveying.choose_chain import Request, choose_chain, widest_chain
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.systems.survey_result import SavedSurvey, Survey, load_survey
 
@@ -161,7 +161,7 @@ def plan_run(
         For whatever is wrong with the options.
     """
     options.check()
-    widest_chain, request = find_request(options)
+    asked_chain, request = find_request(options)
     air, attenuation = None, options.attenuation
     if options.visibility is not None:
         attenuation = attenuation_of_visibility(options.visibility, options.wavelength or 1064.0)
@@ -170,7 +170,7 @@ def plan_run(
         air = (float(attenuation), float(options.attenuation_error or 0.0))  # [dB/km] and its error
     template = StripJob(
         Path(),
-        widest_chain,
+        asked_chain,
         options,
         tuple(entry.removeprefix("+") for entry in split_columns(options.columns) if entry.strip(" +")),
         request,
@@ -237,7 +237,7 @@ def find_request(options: RunOptions) -> tuple[Chain, Request]:
     auto = asked == AUTO and options.tolerance is None
     request = Request(auto, options.tolerance, saved, options.survey == "flight", options.force)
     if asked == AUTO:
-        return widest(request), request
+        return widest_chain(request), request
     return asked if isinstance(asked, Chain) else load_chain(asked), request
 
 

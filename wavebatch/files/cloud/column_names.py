@@ -175,9 +175,9 @@ def resolve(name: str, *kinds: Mapping[str, Any]) -> Any:
 
 
 def name_standard(point_format: int) -> dict[str, str]:
-    """Return the names of the fields of a point format, x, y and z for its integers, each with the field that it means.
+    """Return the names that users may give to the fields of a point format, each with its field.
 
-    The scan angle also has the name that other point formats give it.
+    Coordinates are x, y and z, not the stored integers. The scan angle has the names of all point formats.
     """
     names = ("x", "y", "z", *(name for name in las.list_dimensions(point_format) if name not in ("X", "Y", "Z")))
     angle = next(name for name in names if name in ("scan_angle", "scan_angle_rank"))
@@ -185,7 +185,7 @@ def name_standard(point_format: int) -> dict[str, str]:
 
 
 class Placing(Protocol):
-    """A header or a reader: what stored positions mean."""
+    """A header or a reader: has scales and offsets, which turn stored positions into coordinates."""
 
     scales: tuple[float, ...]
     offsets: tuple[float, ...]

@@ -85,7 +85,7 @@ class PointFilter:
             raise ConfigError(f"--bbox: {','.join(f'{edge:.15g}' for edge in box)} {order}")
         polygons, file = () if polygon is None else tuple(load_polygons(polygon)), None
         if polygon is not None:
-            # All that decides where they lie; the strip's part of it is in its header, which --resume compares too.
+            # What decides where they lie, besides the header of the strip, which --resume compares too.
             corners = b"".join(ring.tobytes() + b"|" for one in polygons for ring in one.rings)
             crs = next((one.file.crs for one in polygons if one.file is not None), None)
             file = {"file": str(polygon), "corners_sha256": hashlib.sha256(corners).hexdigest(), "crs": crs}
@@ -121,7 +121,7 @@ class PointFilter:
         Raises
         ------
         ConfigError
-            For a column that there is not; with its place in the text of --where.
+            For a column that does not exist; the message says where it stands in --where.
         """
         columns = {}
         if self.where is not None:

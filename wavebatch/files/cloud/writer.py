@@ -67,7 +67,7 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
     evlrs, _ = las.find_evlrs(path, header)
     pairs = zip(header.vlrs, repair_records(header.vlrs), strict=True)
     repaired = next((new.payload.rstrip(b"\0").decode() for old, new in pairs if new is not old), None)
-    # The writer of the cloud repairs extended records as it copies them; the line is for them too.
+    # CloudWriter repairs extended records as it copies them; the note is about these too.
     wrong = repaired is not None or any(repair_evlr(path, evlr) is not None for evlr in evlrs)
     notes = (_REPAIRED,) * wrong
     if wanted == "1.3":  # if it can hold all that the strip has
@@ -94,7 +94,7 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
             note += "add a WKT record to the strip"
             if target < 6:
                 note = f"written in point format {target} of LAS 1.4 in place of {modern}: {why}; "
-                note += f"--point-format {modern} tries"
+                note += f"to try that format, give --point-format {modern}"
             return Version(max(header.version, (1, 4)), target, None, (note, *notes))
         return Version(max(header.version, (1, 4)), modern, wkt or repaired, notes)
     wkt = repaired
@@ -341,6 +341,7 @@ def plan_output(
 
 
 _DESCRIPTORS = range(100, 356)
+"""Record numbers of wave packet descriptors."""
 MOST_PAYLOAD = 65535
 """Bytes that a VLR can hold."""
 
