@@ -212,7 +212,7 @@ def judge(samples: Samples, echoes: Candidates, rng: np.random.Generator) -> Non
     width, level = 10 ** rng.uniform(-3, 3, 2)
     curve = tuple(zip(np.sort(rng.normal(0, 9, rng.integers(0, 4))), rng.random(3), strict=False))
     law = Unexplained(5.0, 0.1, level, 9.0, 1.0, curve, 1.0, 1.0, level, 0.1, width, 1.0)
-    assert (neighbours.weigh_fits(table, law, others=True)[0] >= 1).all()
+    assert (neighbours.weigh_fits(table.columns(), law, others=True)[0] >= 1).all()
     flagging = Flagging(0.5, 0.5 * s, width, width, level, 1.5, 0.1)
     faint = Faintness(0.1, 0, 9, True, level, 0.1, curve, 1, 5, 9, 2, 2, 2)
     error = rng.choice([0.0, 1.0])

@@ -184,28 +184,22 @@ class CKeeping(ctypes.Structure):
     _fields_ = [*_fields(_POINTER, "std factors"), *_fields(ctypes.c_double, "spacing last significance")]
 
 
-class CKept(ctypes.Structure):
-    """`Kept` of kernels/c/echoes.h."""
+class CTable(ctypes.Structure):
+    """`Table` of kernels/c/echoes.h."""
 
-    _fields_ = _fields(
-        _POINTER,
-        "waveform time amplitude sigma time_err amplitude_err sigma_err relative_energy_err residual flags row",
-    )
+    _fields_ = [
+        *_fields(ctypes.c_int64, "m"),
+        *_fields(
+            _POINTER,
+            "waveform time amplitude sigma time_err amplitude_err sigma_err relative_energy_err residual flags row",
+        ),
+    ]
 
 
 class COffsets(ctypes.Structure):
     """`Offsets` of kernels/c/returns.h."""
 
     _fields_ = _fields(_POINTER, "offset doubt known")
-
-
-class CTable(ctypes.Structure):
-    """`Table` of kernels/c/neighbours.h."""
-
-    _fields_ = [
-        *_fields(ctypes.c_int64, "m"),
-        *_fields(_POINTER, "waveform time amplitude sigma time_err amplitude_err sigma_err residual flags"),
-    ]
 
 
 class CCurve(ctypes.Structure):

@@ -162,7 +162,7 @@ def leave_beside(system: SystemPulse) -> bool:
 
 def misfit_factor(table: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
     """Return by how much errors of fitted echoes are larger than those of noise alone (m,); else as `unexplained`."""
-    missed, variance = weigh_fits(table, unexplained(system, spacing), others=leave_beside(system))
+    missed, variance = weigh_fits(table.columns(), unexplained(system, spacing), others=leave_beside(system))
     return np.sqrt(missed * (1 + variance))
 
 
@@ -208,7 +208,7 @@ def find_unexplained(table: EchoTable, system: SystemPulse, spacing: float) -> n
     float64 array, shape (m,)
         chi2 per sample of the echo's fit, over what is expected; 1 where chance explains it.
     """
-    return weigh_fits(table, unexplained(system, spacing), others=False)[0]
+    return weigh_fits(table.columns(), unexplained(system, spacing), others=False)[0]
 
 
 def list_neighbours(table: EchoTable) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -18,13 +18,14 @@ typedef struct { /* what fits become echoes */
     double spacing, last, significance;        /* last sample of a waveform; least energy of an echo, in noise */
 } Keeping;
 
-typedef struct { /* columns of the echoes that are kept, and the row of each among the fitted ones */
+typedef struct { /* core columns of a table of m echoes, and the row of each among the fitted ones */
+    int64_t m;
     int32_t *waveform;
     double *time;
     float *amplitude, *sigma, *time_err, *amplitude_err, *sigma_err, *relative_energy_err, *residual;
     uint16_t *flags;
     int64_t *row;
-} Kept;
+} Table;
 
 static double root_of(double variance) { return sqrt(variance < 0 ? 0 : variance); }
 
@@ -63,7 +64,7 @@ EXPORT int64_t describe_echoes(int64_t n, const Whole *whole, double *values, do
 }
 
 /* Returns the number of echoes that are kept. */
-EXPORT int64_t keep_echoes(const Clusters *clusters, const Echoes *fits, const Whole *whole, const Keeping *keeping, const Kept *out) {
+EXPORT int64_t keep_echoes(const Clusters *clusters, const Echoes *fits, const Whole *whole, const Keeping *keeping, const Table *out) {
     int64_t kept = 0, row = 0;
     for (int64_t c = 0; c < clusters->n; c++) {
         const int64_t waveform = clusters->waveform[c];

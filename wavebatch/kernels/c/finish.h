@@ -19,18 +19,14 @@ typedef struct { /* steps in this order; what is 0 or NULL is left out */
     const double *factors;                     /* on the errors of each fitted echo, four each, for `grown` */
 } Finishing;
 
-static Table as_table(const Kept *e, int64_t m) {
-    return (Table){m, e->waveform, e->time, e->amplitude, e->sigma, e->time_err, e->amplitude_err, e->sigma_err, e->residual, e->flags};
-}
-
 typedef struct { int32_t waveform; double time; float floats[7]; uint16_t flags; int64_t row; } OneEcho;
 
-static OneEcho get_echo(const Kept *e, int64_t i) {
+static OneEcho get_echo(const Table *e, int64_t i) {
     return (OneEcho){e->waveform[i], e->time[i], {e->amplitude[i], e->sigma[i], e->time_err[i], e->amplitude_err[i], e->sigma_err[i],
         e->relative_energy_err[i], e->residual[i]}, e->flags[i], e->row[i]};
 }
 
-static void put_echo(const Kept *e, int64_t i, OneEcho one) {
+static void put_echo(const Table *e, int64_t i, OneEcho one) {
     float *const columns[] = {e->amplitude, e->sigma, e->time_err, e->amplitude_err, e->sigma_err, e->relative_energy_err, e->residual};
     e->waveform[i] = one.waveform;
     e->time[i] = one.time;
@@ -40,8 +36,8 @@ static void put_echo(const Kept *e, int64_t i, OneEcho one) {
 }
 
 /* Each echo moves before those that it precedes: echoes of one place keep their order. */
-static void sort_echoes(const Kept *e, int64_t m) {
-    for (int64_t i = 1; i < m; i++) {
+static void sort_echoes(const Table *e) {
+    for (int64_t i = 1; i < e->m; i++) {
         int64_t to = i;
         while (to && (e->waveform[to - 1] > e->waveform[i] || (e->waveform[to - 1] == e->waveform[i] && e->time[to - 1] > e->time[i]))) to--;
         if (to == i) continue;
@@ -51,14 +47,13 @@ static void sort_echoes(const Kept *e, int64_t m) {
     }
 }
 
-/* Keeps the echoes that are not marked, in their order, and returns their number. */
-static int64_t leave_out(const Kept *e, int64_t m, const uint8_t *marked) {
-    const uint8_t *const first = memchr(marked, 1, m);
-    if (!first) return m;
-    int64_t kept = first - marked;
-    for (int64_t i = kept; i < m; i++)
+/* Keeps the echoes that are not marked, in their order. */
+static void leave_out(Table *e, const uint8_t *marked) {
+    const uint8_t *const first = memchr(marked, 1, e->m);
+    int64_t kept = first ? first - marked : e->m;
+    for (int64_t i = kept; i < e->m; i++)
         if (!marked[i]) put_echo(e, kept++, get_echo(e, i));
-    return kept;
+    e->m = kept;
 }
 
 /* How far a time [samples] lies from the nearest gap of its waveform: negative inside of it, infinite without one. */
@@ -82,7 +77,7 @@ static double gap_distance(const Block *b, int64_t waveform, double time) {
 static float lesser(float a, float b) { return isnan(a) || a < b ? a : b; }
 
 /* Two echoes as one in the place of the first: with their area, mean time and variance, and the better errors. */
-static void merge_pair(const Kept *e, int64_t i) {
+static void merge_pair(const Table *e, int64_t i) {
     const int64_t j = i + 1;
     const double a = (double)e->amplitude[i] * e->sigma[i], b = (double)e->amplitude[j] * e->sigma[j];
     const double total = a + b < 1e-12 ? 1e-12 : a + b, share = a / total;
@@ -101,38 +96,36 @@ static void merge_pair(const Kept *e, int64_t i) {
 }
 
 /* Clears OVERLAPPED of echoes without another one that has it in their waveform: the partners of their fit are gone. */
-static void clear_lone(const Kept *e, int64_t m) {
-    const Table table = as_table(e, m);
-    for (int64_t i = 0, end; i < m; i = end) {
+static void clear_lone(const Table *e) {
+    for (int64_t i = 0, end; i < e->m; i = end) {
         int64_t number = 0, last = 0;
-        end = end_of_waveform(&table, i);
+        end = end_of_waveform(e, i);
         for (int64_t j = i; j < end; j++)
             if (e->flags[j] & FLAG_OVERLAPPED) number++, last = j;
         if (number == 1 && !(e->flags[last] & FLAG_MERGED)) e->flags[last] &= ~FLAG_OVERLAPPED;
     }
 }
 
-/* m echoes, sorted or to be sorted by waveform, then time. `grown`, or NULL: factors on the errors of amplitudes, up to 1, by how much they grew
-   here. Returns how many stay. */
-EXPORT int64_t finish_echoes(int64_t m, const Kept *e, const Block *b, const Finishing *f, float *grown) {
-    double *room = malloc((2 * m + 1) * sizeof *room), *variance = room + m;
+/* Echoes that are sorted, or to be sorted, by waveform, then time. `grown`, or NULL: factors on the errors of amplitudes, up to
+   1, by how much they grew here. */
+EXPORT int64_t finish_echoes(Table *e, const Block *b, const Finishing *f, float *grown) {
+    double *room = malloc((2 * e->m + 1) * sizeof *room), *variance = room + e->m;
     uint8_t *marked = (uint8_t *)room;
     int64_t *pair = (int64_t *)variance;
     if (!room) return -1;
-    if (f->sort) sort_echoes(e, m);
+    if (f->sort) sort_echoes(e);
     if (f->gaps > 0 && b->missing) {           /* an echo between two recorded samples is known, however narrow it is */
-        for (int64_t i = 0; i < m; i++) {
+        for (int64_t i = 0; i < e->m; i++) {
             const float half = 0.5f * e->sigma[i] / (float)f->gaps;
             marked[i] = gap_distance(b, e->waveform[i], e->time[i] / f->gaps) < -(half > 1 ? half : 1);
         }
-        m = leave_out(e, m, marked);
+        leave_out(e, marked);
     }
     for (int merging = 0; merging < 2; merging++) {
         const double width = merging ? f->overlap : f->twins;
-        for (int64_t found = m; found && width > 0; m = leave_out(e, m, marked)) {
-            const Table table = as_table(e, m);
-            found = find_pairs(&table, width, merging ? f->unresolved : 0, pair);
-            memset(marked, 0, m);
+        for (int64_t found = e->m; found && width > 0; leave_out(e, marked)) {
+            found = find_pairs(e, width, merging ? f->unresolved : 0, pair);
+            memset(marked, 0, e->m);
             for (int64_t k = 0; k < found; k++) {
                 const int64_t i = pair[k];
                 if (merging) merge_pair(e, i);
@@ -142,15 +135,13 @@ EXPORT int64_t finish_echoes(int64_t m, const Kept *e, const Block *b, const Fin
         }
     }
     if (f->unproven) {
-        const Table table = as_table(e, m);
-        find_faint(&table, f->unproven, marked);
-        m = leave_out(e, m, marked);
+        find_faint(e, f->unproven, marked);
+        leave_out(e, marked);
     }
-    const Table table = as_table(e, m);
     if (f->unexplained) {
-        memset(variance, 0, m * sizeof *variance);
-        weigh_fits(&table, f->unexplained, room, f->others ? variance : NULL);
-        for (int64_t i = 0; i < m; i++) {
+        memset(variance, 0, e->m * sizeof *variance);
+        weigh_fits(e, f->unexplained, room, f->others ? variance : NULL);
+        for (int64_t i = 0; i < e->m; i++) {
             const float factor = (float)sqrt(room[i] * (1 + variance[i])), before = e->amplitude_err[i];
             float *const errors[] = {e->time_err, e->amplitude_err, e->sigma_err, e->relative_energy_err};
             for (int k = 0; k < 4; k++) errors[k][i] *= factor;
@@ -159,17 +150,18 @@ EXPORT int64_t finish_echoes(int64_t m, const Kept *e, const Block *b, const Fin
             grown[i] = (float)(colour > 1 ? 1 : colour) * e->amplitude_err[i] / before;
         }
     }
-    if (f->lone) clear_lone(e, m);
+    if (f->lone) clear_lone(e);
     if (f->flagging) {
-        set_flags(&table, b, f->flagging, e->flags);
-        for (int64_t i = 0; i < m && b->missing; i++)
-            if (gap_distance(b, e->waveform[i], e->time[i] / f->flagging->spacing) * f->flagging->spacing < e->sigma[i]) e->flags[i] |= FLAG_NEAR_EDGE;
+        const double spacing = f->flagging->spacing;
+        set_flags(e, b, f->flagging);
+        for (int64_t i = 0; i < e->m && b->missing; i++)
+            if (gap_distance(b, e->waveform[i], e->time[i] / spacing) * spacing < e->sigma[i]) e->flags[i] |= FLAG_NEAR_EDGE;
     }
     if (f->ringing) {
-        find_faint(&table, f->ringing, marked);
-        for (int64_t i = 0; i < m; i++)
+        find_faint(e, f->ringing, marked);
+        for (int64_t i = 0; i < e->m; i++)
             if (marked[i] && e->amplitude[i] > 0) e->flags[i] |= FLAG_RINGING;
     }
     free(room);
-    return m;
+    return 0;
 }

@@ -1,18 +1,10 @@
 /* Echoes beside others of their waveform, and over their samples: which ones errors of a stronger one explain, what those
    errors add, and flags. finish.h takes echoes through them; stages/flags.py and stages/decompose/merge.py have the reasons.
 
-   Columns are float32, and so are products with them. */
+   Tables are sorted by waveform, then time. Columns are float32, and so are products with them. */
 
 enum { NEIGHBOURS = 5 };                       /* each echo is compared with this many before and after it */
 enum { FLAG_NEAR_EDGE = 4, FLAG_SATURATED = 8, FLAG_WEAK = 32, FLAG_NARROW = 128, FLAG_UNRELIABLE = 16384 };
-
-typedef struct { /* core columns of a table of m echoes, sorted by waveform, then time */
-    int64_t m;
-    const int32_t *waveform;
-    const double *time;
-    const float *amplitude, *sigma, *time_err, *amplitude_err, *sigma_err, *residual;
-    const uint16_t *flags;
-} Table;
 
 typedef struct { int64_t n; const double *lag, *value; } Curve; /* lines between points, ascending; none where n is 0 */
 
@@ -119,7 +111,7 @@ static int is_clipped(const Block *b, int64_t waveform, int64_t from, int64_t to
 }
 
 /* Sets flags of echoes that need no fit; waveforms have one level each. */
-static void set_flags(const Table *t, const Block *b, const Flagging *f, uint16_t *flags) {
+static void set_flags(const Table *t, const Block *b, const Flagging *f) {
     const int64_t s = b->length;
     const double level = b->bytes ? f->level : (float)f->level;
     for (int64_t i = 0; i < t->m; i++) {
@@ -132,7 +124,7 @@ static void set_flags(const Table *t, const Block *b, const Flagging *f, uint16_
         const double low = ceil(fmin(fmax((time - reach) / f->spacing, 0), s)), high = floor(fmin(fmax((time + reach) / f->spacing, -1), s - 1));
         if (is_clipped(b, waveform, (int64_t)low, (int64_t)high, level))
             set |= FLAG_SATURATED | ((float)f->unreliable * amplitude > (float)f->level - b->baseline[waveform] ? FLAG_UNRELIABLE : 0);
-        flags[i] = t->flags[i] | set;
+        t->flags[i] |= set;
     }
 }
 

@@ -423,7 +423,7 @@ def keep_echoes(
         "keep_echoes", library.CClusters(n, library.address(waveform)),
         library.Echoes(m, *map(library.address, fits)), whole.as_structure(fits[4][:, 2]),
         library.CKeeping(library.address(std), library.address(factors), spacing, length - 1, significance),
-        library.CKept(*map(library.address, columns.values())),
+        library.CTable(m, *map(library.address, columns.values())),
     )  # fmt: skip
     found = {name: column[:kept] for name, column in columns.items()}
     return found, found.pop("row")

@@ -7,7 +7,7 @@ pairs. Laws say which echoes are faint, or what fits leave unexplained; stages m
 from __future__ import annotations
 
 import ctypes
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ Points = tuple[tuple[float, float], ...]
 
 _FLOATS = "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "relative_energy_err", "residual"
 COLUMNS = {"waveform": np.int32, "time": np.float64, **dict.fromkeys(_FLOATS, np.float32), "flags": np.uint16}
-"""Core columns of an EchoTable, in the order of `Kept` of kernels/c/echoes.h."""
+"""Core columns of an EchoTable, in the order of `Table` of kernels/c/echoes.h."""
 
 
 class Faintness(NamedTuple):
@@ -88,13 +88,13 @@ class Flagging(NamedTuple):
     """AMPLITUDE_UNRELIABLE: this share of the amplitude is above the level."""
 
 
-def weigh_fits(echoes: Any, law: Unexplained, *, others: bool) -> tuple[np.ndarray, np.ndarray]:
+def weigh_fits(echoes: dict[str, np.ndarray], law: Unexplained, *, others: bool) -> tuple[np.ndarray, np.ndarray]:
     """Find by how much fits miss their samples, and what echoes leave beside others.
 
     Parameters
     ----------
-    echoes : with the core columns of an EchoTable, arrays (m,)
-        Sorted by waveform, then time.
+    echoes : dict of arrays (m,)
+        The core columns of an EchoTable, sorted by waveform, then time.
     law : Unexplained
     others : bool
         Whether others of the waveform leave anything.
@@ -106,7 +106,7 @@ def weigh_fits(echoes: Any, law: Unexplained, *, others: bool) -> tuple[np.ndarr
     beside : float64 (m,)
         Largest of what the others leave, in the variance of the echo; 0 without `others`.
     """
-    table, (unexplained, beside) = _as_table(echoes), np.zeros((2, len(echoes.time)))
+    table, (unexplained, beside) = _as_table(echoes), np.zeros((2, len(echoes["time"])))
     call("weigh_fits", table, _as_unexplained(law), unexplained, beside if others else None)
     return unexplained, beside
 
@@ -171,9 +171,7 @@ def finish_echoes(
         raise ValueError("a waveform has more than one level")
     if m and not 0 <= columns["waveform"].min() <= columns["waveform"].max() < len(samples.counts):
         raise ValueError("an echo lies in no waveform")
-    columns = {name: np.ascontiguousarray(columns[name], kind) for name, kind in COLUMNS.items()}
-    if {len(column) for column in columns.values()} != {m}:
-        raise ValueError("columns of echoes differ in length")
+    table = _as_table(columns, row)
     if factors is not None and (factors.shape[1:] != (4,) or (m and not 0 <= row.min() <= row.max() < len(factors))):
         raise ValueError("an echo has no factors")
     laws = {
@@ -184,20 +182,19 @@ def finish_echoes(
     }
     given = steps._asdict() | {name: law and ctypes.addressof(law) for name, law in laws.items()}
     structure = library.CFinishing(**given, factors=None if factors is None else place(factors, np.float64))
-    kept = library.CKept(*map(library.address, columns.values()), place(row, np.int64))
     grown = None if factors is None else np.empty(m, np.float32)
-    left = call("finish_echoes", ctypes.c_int64(m), kept, samples.as_block(), structure, grown)
-    found = {name: column[:left] for name, column in columns.items()}
-    return found, row[:left], None if grown is None else grown[:left]
+    call("finish_echoes", table, samples.as_block(), structure, grown)
+    found = {name: column[: table.m] for name, column in table.arrays.items()}
+    return found, row[: table.m], None if grown is None else grown[: table.m]
 
 
-def _as_table(echoes: Any) -> library.CTable:
-    """The structure, which points into the columns."""
-    names = [field[0] for field in library.CTable._fields_[1:]]
-    columns = [np.ascontiguousarray(getattr(echoes, name), COLUMNS[name]) for name in names]
-    if {len(column) for column in columns} != {len(columns[0])}:
+def _as_table(echoes: dict[str, np.ndarray], row: np.ndarray | None = None) -> library.CTable:
+    """The structure, which holds the columns to which it points."""
+    columns = {name: np.ascontiguousarray(echoes[name], kind) for name, kind in COLUMNS.items()}
+    m = len(columns["time"])
+    if {len(column) for column in columns.values()} != {m} or (row is not None and len(row) != m):
         raise ValueError("columns of echoes differ in length")
-    table = library.CTable(len(columns[0]), *map(library.address, columns))
+    table = library.CTable(m, *map(library.address, columns.values()), None if row is None else place(row, np.int64))
     table.arrays = columns
     return table
 
