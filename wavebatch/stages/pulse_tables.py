@@ -280,61 +280,43 @@ def error_factors(
     if not noise.correlation and level_err is None:
         return np.ones((len(width), 4))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    table = _factor_table(shape, limits, noise.correlation, noise.whitening)
+    given = shape, limits, noise.correlation, noise.whitening
+    widths, factors = _factor_table(*given)
     # Only those beside a width that is asked for: to make all takes a tenth of a survey.
     asked = np.append(width[~np.isnan(width)], limits.ref)
-    low, high = np.searchsorted(table.widths, [asked.min(), asked.max()]).tolist()
+    low, high = np.searchsorted(widths, [asked.min(), asked.max()]).tolist()
     low, high = max(low - 1, 0), high + 1
-    table.fill(low, high)
+    missing = low + np.flatnonzero(np.isnan(factors[low:high, 0]))
+    if len(missing):
+        some = widths[missing].tolist()
+        pairs = zip(_pulse_rows(shape, some), some, strict=True)
+        factors[missing] = [_factors_at(joint, at, *given) for joint, at in pairs]
+    widths, factors = widths[low:high], factors[low:high]
     if level_err is None:
-        return interpolate(width, table.widths[low:high], table.factors[low:high, :4])
+        return interpolate(width, widths, factors[:, :4])
     if noise.whitening:
         level_err = level_err * noise.std / noise.quiet
-    found = interpolate(width, table.widths[low:high], table.factors[low:high])
+    found = interpolate(width, widths, factors)
     found[:, 4:] *= level_err[:, None]
     found *= found
     return np.sqrt(found[:, :4] + found[:, 4:])
 
 
-class _FactorTable:
-    """Factors of a pulse in some noise at widths, float64 (k, 8), made when they are asked for.
-
-    They are errors of amplitude, time, width and energy over those that the fit gives, and the same by a level that is
-    wrong by the noise of a sample.
-    """
-
-    def __init__(
-        self, shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...], whitening: tuple[float, ...]
-    ) -> None:
-        # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
-        self._alone = 1.0 if whitening else max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
-        self._given = shape, limits, correlation, whitening
-        self.widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
-        self.factors = np.full((FACTOR_WIDTHS, 8), np.nan)
-
-    def fill(self, low: int, high: int) -> None:
-        """Make the rows from low to high - 1."""
-        missing = low + np.flatnonzero(np.isnan(self.factors[low:high, 0]))
-        if not len(missing):
-            return
-        widths = self.widths[missing].tolist()
-        for row, width, joint in zip(missing, widths, _pulse_rows(self._given[0], widths), strict=True):
-            factors, by_level = _factors_at(joint, width, *self._given)
-            self.factors[row] = np.append(factors / self._alone, by_level)
-
-
-_factor_table = lru_cache(maxsize=16)(_FactorTable)
+@lru_cache(maxsize=16)
+def _factor_table(shape: PulseShape, limits: ShapeLimits, *noise: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Widths (k,), and room for their factors in this noise (k, 8): NaN until they are asked for."""
+    return exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS)), np.full((FACTOR_WIDTHS, 8), np.nan)
 
 
 def _factors_at(
-    joint: np.ndarray,
-    width: float,
-    shape: PulseShape,
-    limits: ShapeLimits,
-    correlation: tuple[float, ...],
-    whitening: tuple[float, ...],
-) -> np.ndarray:
-    """A row of `_FactorTable` (2, 4); joint: `_pulse_rows` of this width."""
+    joint: np.ndarray, width: float, shape: PulseShape, limits: ShapeLimits,
+    correlation: tuple[float, ...], whitening: tuple[float, ...],
+) -> np.ndarray:  # fmt: skip
+    """Errors of amplitude, time, width and energy over those that the fit gives, and by a wrong level (8,).
+
+    joint: the pulse and its derivatives at this width, as `_pulse_rows` has them. The last four are of a level that is
+    wrong by the noise of a sample.
+    """
     seen = joint
     if whitening:
         s = joint.shape[1]
@@ -355,7 +337,10 @@ def _factors_at(
     given = np.einsum("is,is->i", whole, whole)
     weights = np.einsum("if,sf->is", whole, bare) if whitening else whole
     variance = coloured_variance(weights, correlation)
-    return np.stack([np.sqrt(np.maximum(variance / given, LEAST_FACTOR)), weights.sum(axis=1) / np.sqrt(given)])
+    # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
+    alone = 1.0 if whitening else max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
+    by_noise = np.sqrt(np.maximum(variance / given, LEAST_FACTOR)) / alone
+    return np.append(by_noise, weights.sum(axis=1) / np.sqrt(given))
 
 
 def describe_fitted(
