@@ -1,5 +1,6 @@
 """`wavebatch plot histogram` and `map`: what is drawn equals a plain count, whatever the cloud, and says so."""
 
+import json
 import os
 import subprocess
 import sys
@@ -64,6 +65,17 @@ def test_histogram_is_that_of_numpy(cloud):
     assert np.array_equal(found.percentiles[0], np.percentile(good, (5, 50, 95)))
     assert found.facts.label == "amplitude: peak of the echo above the baseline [DN]"
     assert found.facts.unit == COLUMNS["amplitude"].unit
+
+
+def test_the_bins_of_a_histogram_and_the_flags_are_in_its_json(cloud, tmp_path):
+    _, _, amplitude, flags = read_plainly(cloud)
+    words = ("histogram", cloud, "-o", tmp_path / "h.png", "--overwrite", "--json", "-q", "--column")
+    found = json.loads(run(*words, "amplitude", "--bins", 37, "--range", "5:120").stdout)
+    counts, edges = np.histogram(amplitude[~np.isnan(amplitude)], 37, (5.0, 120.0))
+    assert found["series"] == [{"name": cloud.name, "values": counts.tolist()}]
+    assert np.allclose(found["edges"], edges, rtol=1e-12)
+    found = json.loads(run(*words, "echo_flags").stdout)
+    assert {"name": "SATURATED", "values": [int(np.count_nonzero(flags & EchoFlag.SATURATED))]} in found["series"]
 
 
 def test_chosen_bins_hold_all_but_far_outliers(cloud):

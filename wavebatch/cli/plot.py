@@ -127,6 +127,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
                 raise ConfigError(f"{option} is of no use for flags, which are counted by name")
         flags = draw_cloud.count_points_by_flag(clouds, column, chosen)
         draw_cloud.draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
+        names, rows, edges = flags.names, flags.counts.reshape(-1, 1), ()
         total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
@@ -134,8 +135,10 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
         found = draw_cloud.count_values(clouds, column, chosen, **how)
         look = {name: options[name] for name in ("log", "counts", "overwrite")}
         draw_cloud.draw_cloud_histogram(found, output, **look)
+        names, rows, edges = found.names, found.counts, found.edges.tolist()
         total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
-    return text, {"column": options["column"], **asdict(total)}
+    series = [{"name": name, "values": row} for name, row in zip(names, rows.tolist(), strict=True)]
+    return text, {"column": options["column"], **asdict(total), "edges": edges, "series": series}
 
 
 @draws_clouds(
