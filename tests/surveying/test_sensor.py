@@ -312,6 +312,20 @@ def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_pa
             find(strip, trajectory=trajectory)
 
 
+def test_a_digitizer_whose_vectors_contradict_a_trajectory_is_named(tmp_path, edit_points):
+    def turn(points):
+        points["x_t"][points["wavepacket_index"] == 3] += 1.5e-5
+        return points
+
+    flight = Sensor(rate=5000.0, n_samples=40, gains={1: 1.0, 3: 1.0})
+    trajectory = facet_strips.write_trajectory(tmp_path / "t.csv", flight, 2.0)
+    strip = write_strip(tmp_path / "a.las", [Facet(0.3)], flight, 8000)
+    find(strip, trajectory=trajectory)
+    strip = edit_points(strip, tmp_path / "b.las", turn)
+    with pytest.raises(InputError, match="vectors of digitizer 3 are off the trajectory's rays, those of the others"):
+        find(strip, trajectory=trajectory)
+
+
 @pytest.mark.parametrize(("above", "share"), [(20.0, 0.5), (20.0, 0.2), (20.0, 0.08), (5.0, 0.3), (0.0, 0.5)])
 def test_errors_hold_two_sensors_above_each_other(monkeypatch, tmp_path, above, share):
     """Their rays hardly miss a path between them: ranges were 10 m off with errors of 1 m, or 20 m with .00."""

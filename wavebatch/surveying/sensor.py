@@ -17,7 +17,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, median, quantile, robust_std
 from wavebatch.core.trajectory import Trajectory, solve_offset
-from wavebatch.core.units import AIR_ATTENUATION
+from wavebatch.core.units import AIR_ATTENUATION, name_first
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.raw_bytes import naming
 from wavebatch.files.las.crs import read_crs_definition
@@ -519,12 +519,23 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
         ahead = ahead / distance[:, None]
         unit = rays.direction / np.sqrt((rays.direction**2).sum(axis=1))[:, None]
         cosine = np.clip(np.einsum("ni,ni->n", ahead, unit), -1.0, 1.0)
-    cosine = cosine[np.isfinite(cosine)]
-    if not len(cosine):
+    known = np.isfinite(cosine)
+    if not known.any():
         return 0.0
-    angle, most = (quantile(np.arccos(cosine), share) for share in (0.5, 1.0 - MOST_MISS))
+    angles, digitizer = np.arccos(cosine[known]), rays.digitizer[known]
+    angle, most = (quantile(angles, share) for share in (0.5, 1.0 - MOST_MISS))
     if most > LARGEST_ANGLE:
         share, off = ("half", angle) if angle > LARGEST_ANGLE else ("a tenth", most)
+        wrong = {
+            one: bool(np.mean(angles[digitizer == one] > LARGEST_ANGLE) > MOST_MISS)
+            for one in distinct(digitizer).tolist()
+        }
+        if not all(wrong.values()) and any(wrong.values()):
+            which = name_first([f"digitizer {one}" for one, is_wrong in wrong.items() if is_wrong])
+            raise InputError(
+                f"the packets' vectors of {which} are off the trajectory's rays, those of the others agree with them: "
+                "compute their vectors again, or leave out --trajectory"
+            )
         raise InputError(
             f"{share} of the trajectory's rays are {np.degrees(off):.1f} degrees off the packets' vectors: it belongs "
             "to another strip, or to a part of this one, has another CRS, or its clock is off by seconds (UTC is 18 s "

@@ -464,6 +464,8 @@ class RaySample(NamedTuple):
     """Relative weight (inverse variance) of the direction, f8 (n,)."""
     vector: np.ndarray = np.empty((0, 3))
     """Of pairs: the packet's, away from the sensor, any length, f8 (n, 3); NaN where it is no direction."""
+    digitizer: np.ndarray = np.empty(0, np.uint8)
+    """Index of the packet's digitizer, u1 (n,)."""
 
 
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySample]:
@@ -487,11 +489,12 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
         square = (apart * apart).sum(axis=1)
         far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
         middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
-        pairs.append(RaySample(time[place[far]], middle, apart[far], square[far], away[place[far]]))
+        digitizer, first = points["wavepacket_index"], place[far]
+        pairs.append(RaySample(time[first], middle, apart[far], square[far], away[first], digitizer[first]))
         step = len(points) // RAYS_PER_SLICE
         rows = np.arange(0, len(points), step + GOLDEN if step > 1 else 1).astype(np.int64)
         rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
-        kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows]))
+        kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows], digitizer[rows]))
         return float(time[0]), bool(np.count_nonzero(time[1:] < time[:-1]) > MIXED * len(time))
 
     units = _choose_units(scan)
@@ -510,7 +513,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
             take(edge, min(edge + SLICE_POINTS, stop))
     samples = []
     for parts in (kept, pairs):
-        columns = [np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3))]
+        columns = [np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3)), np.empty(0, "u1")]
         if parts:
             columns = [np.concatenate(values) for values in zip(*parts, strict=True)]
         order = np.argsort(columns[0], kind="stable")
