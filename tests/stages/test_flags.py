@@ -299,6 +299,23 @@ def test_echoes_of_no_waveform_are_refused(table):
         flag_echoes(block, noise, SystemPulse(2.0), last)
 
 
+def test_columns_and_factors_that_do_not_fit_are_refused(table):
+    columns, row, ones = table.columns(), np.arange(len(table)), np.ones(N, np.float32)
+    samples, none = Samples(np.zeros((N, S), np.uint8), ones, ones), Finishing()
+    with pytest.raises(ValueError, match="more than one level"):
+        finish_echoes(columns, row, samples._replace(baseline=np.ones((N, S), np.float32)), none)
+    with pytest.raises(ValueError, match="differ in length"):
+        finish_echoes(columns | {"sigma": table.sigma[1:]}, row, samples, none)
+    with pytest.raises(ValueError, match="differ in length"):
+        finish_echoes(columns, row[1:], samples, none)
+    covering = Finishing(unexplained=unexplained(SystemPulse(2.0), 0.5))
+    for factors in np.ones((len(table) - 1, 4)), np.ones((len(table), 3)):
+        with pytest.raises(ValueError, match="no factors"):
+            finish_echoes(columns, row, samples, covering, factors)
+    with pytest.raises(ValueError, match="how errors grow"):
+        finish_echoes(columns, row, samples, none, np.ones((len(table), 4)))
+
+
 @pytest.mark.parametrize(("baseline", "spread", "floor"), [(2.9, 0.0, -np.inf), (3.1, 0.0, 0.0), (4.0, 1.0, -np.inf)])
 def test_count_0_is_a_floor_where_noise_does_not_reach_it(baseline, spread, floor):
     noise = ReceiverNoise(std=2.0, baseline=baseline, baseline_spread=spread, by_kind={"quiet": 1.0})

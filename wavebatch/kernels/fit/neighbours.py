@@ -174,6 +174,8 @@ def finish_echoes(
     table = _as_table(columns, row)
     if factors is not None and (factors.shape[1:] != (4,) or (m and not 0 <= row.min() <= row.max() < len(factors))):
         raise ValueError("an echo has no factors")
+    if factors is not None and steps.unexplained is None:
+        raise ValueError("nothing says how errors grow")
     laws = {
         "unproven": steps.unproven and _as_faintness(steps.unproven),
         "unexplained": steps.unexplained and _as_unexplained(steps.unexplained),
