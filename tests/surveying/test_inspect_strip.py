@@ -73,6 +73,14 @@ def test_check_gives_every_problem_a_line_with_its_place(tmp_path):
     assert all(line.startswith(f"{path}: ") for line in lines)
 
 
+def test_check_counts_points_without_a_possible_time(tmp_path):
+    raw = make_raw(60, most_returns=1)
+    raw.points["gps_time"][:4] = np.nan, np.inf, 1e300, -1e11
+    result = succeed("check", raw.write(tmp_path / "a.las"))
+    assert "note: 4 points without a possible GPS time: neither their pulses nor ranges can be known" in result.stdout
+    assert "GPS time" not in succeed("check", make_raw(60).write(tmp_path / "b.las")).stdout
+
+
 def test_check_as_json_and_several_files(tmp_path):
     good = make_raw().write(tmp_path / "good.las")
     result = run("check", good, make_bad(tmp_path), tmp_path / "none.las", "--json")

@@ -18,6 +18,7 @@ import numpy as np
 from wavebatch.core.echoes import without_nan
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.frozen import frozen
+from wavebatch.core.units import count
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.las.header import LasHeader, read_header
@@ -34,6 +35,9 @@ _SAMPLED = 4096
 
 _MATCHED = 1024
 """Waveforms whose echoes are compared with the returns."""
+
+LARGEST_TIME = 1e10
+"""No GPS time is later [s]: three centuries."""
 
 LEAST_RETURNS, LEAST_MATCHED = 20, 0.5
 """Returns in waveforms with echoes, and share of them that an echo should match: below it the packets are doubted. Own
@@ -119,16 +123,20 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
 
 
 def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:
-    """Yield a line for each count or bound of the header that the points contradict."""
+    """Yield a line for each count or bound of the header that the points contradict, and for points without a time."""
     facts = reader.facts
     claimed = read_header(facts.path)
     true = LasHeader(claimed.version, claimed.point_format, claimed.point_length, claimed.scales, claimed.offsets)
-    statistics = Statistics(facts.dtype, ())
+    statistics, timeless = Statistics(facts.dtype, ()), 0
     for start, stop in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
-        statistics.add(reader.read_points(start, stop))
+        points = reader.read_points(start, stop)
+        statistics.add(points)
+        timeless += int(np.count_nonzero(~(np.abs(points["gps_time"]) < LARGEST_TIME)))
     statistics.fill(true)
     if not true.point_count:
         return
+    if timeless:
+        yield f"{count(timeless, 'point')} without a possible GPS time: neither their pulses nor ranges can be known"
     known = 15 if claimed.version >= (1, 4) else 5
     if claimed.by_return[:known] != true.by_return[:known]:
         first, really = claimed.by_return[0], true.by_return[0]
