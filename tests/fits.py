@@ -25,16 +25,17 @@ def settings(**options):
     return Settings(**{"width_ref": 2.0, "width_low": 1.4, "width_high": 8.0, "grow": False} | options)
 
 
-def decompose(y, start, std=1.0, missing=None, **options):
-    """The Solution of rows y (m, L), counts above a level of 0, from starts (m, 3, k)."""
+def decompose(y, start, std=1.0, missing=None, level_err=None, **options):
+    """The Solution of rows y (m, L), counts above a level of 0, from starts (m, 3, k); level_err: a number."""
     m, _, k = start.shape
     y = np.ascontiguousarray(y) if y.dtype in (np.uint8, np.uint16, np.uint32) else y.astype(np.float32)
-    samples = Samples(y, np.zeros(m, np.float32), np.full(m, std, np.float32), missing)
+    levels = None if level_err is None else np.full(m, level_err, np.float32)
+    samples = Samples(y, np.zeros(m, np.float32), np.full(m, std, np.float32), missing, levels)
     rows = np.arange(m)
     amplitude, time, width = (start[:, i].ravel().astype(float) for i in range(3))
     clusters = Clusters(rows, 0 * rows, 0 * rows + y.shape[1], rows * k, 0 * rows + k)
     return decompose_clusters(samples, Candidates(np.repeat(rows, k), time, amplitude, width), clusters,
-                              settings(**options))  # fmt: skip
+                              settings(free_levels=level_err is not None, **options))  # fmt: skip
 
 
 def fit(y, start, **options):

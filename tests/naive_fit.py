@@ -26,6 +26,13 @@ def whiten(n, clipped, near, far):
     return white
 
 
+def free_level(white, clipped, error):
+    """Matrix (n, n) that whitens noise to which the error of a level adds: this over the noise; by its eigenvalues."""
+    ones = white @ np.where(clipped, 0.0, 1.0)
+    values, vectors = np.linalg.eigh(np.eye(len(ones)) + error**2 * np.outer(ones, ones))
+    return vectors @ np.diag(values**-0.5) @ vectors.T @ white
+
+
 def fit_stack(stack, components, weight):
     """Twin of kernels/c/stack.h: weight, delay and sigma of each Gaussian (c, 3), fitted between their bounds."""
     start = np.ravel(components).astype(float)
@@ -78,7 +85,7 @@ def new_pulse(x, i, s):
 
 def is_misfit(p, x, residual, std, s, white=None, shape=None):
     """Whether the residual holds more than noise."""
-    if white is not None:
+    if s.whitening is not None:
         new = [white @ new_pulse(x, i, s) for i in range(1, len(x) - 1)]
         highest = max(one @ residual / np.sqrt(one @ one) for one in new)
         h3, h4 = moments(p, x, residual, std, white, shape)
@@ -106,7 +113,7 @@ def propose(p, x, residual, std, s, shape, white=None):
     ref = s.width_ref
     old = np.array([np.maximum(a + da, 0.2 * a), t + np.clip(dt, -ref, ref), w + np.clip(ds, -0.4 * w, 0.3 * w)])
     start, promise = np.c_[old, [height, x[place], ref]], best / std**2
-    h3, h4 = moments(p, x, residual, std, white, shape)
+    h3, h4 = moments(p, x, residual, std, None if s.whitening is None else white, shape)
     gain = np.where(h4 < 0, h3**2 + h4**2, 0.0)
     j = int(np.argmax(gain))
     if gain[j] > promise:
@@ -306,7 +313,7 @@ def describe_whole(whole, fitted, error, shared):
     return value, value_error
 
 
-def keep(clusters, solution, whole, factors, std, spacing, length, significance):
+def keep(clusters, solution, whole, factors, std, spacing, length, significance, acceptance=0.0, level_err=None):
     """Rows of the echoes that are kept, as tuples in the order of the columns of a table of echoes."""
     rows, energies = [], relative_energy_errors(solution.parameters[:, :3], solution.errors[:, :3], solution.shared)
     for i, c in enumerate(np.repeat(np.arange(len(solution.number)), solution.number)):
@@ -315,6 +322,11 @@ def keep(clusters, solution, whole, factors, std, spacing, length, significance)
         errors = errors * factors[i, :3]
         noise = np.float32(significance) * std[clusters.waveform[c]]
         strong = amplitude * amplitude * width * np.sqrt(np.pi) >= noise * noise
+        if level_err is not None:
+            ratio = float(level_err[clusters.waveform[c]]) / float(std[clusters.waveform[c]])
+            ratio = ratio * ratio / (1 + ratio * ratio * max(clusters.high[c] - clusters.low[c], 5 * width))
+            rest = amplitude * amplitude * width * (np.sqrt(np.pi) - 2 * np.pi * width * ratio)
+            strong &= rest >= acceptance * float(std[clusters.waveform[c]]) ** 2
         if not (strong and -0.5 * width <= time <= length - 1 + 0.5 * width and np.isfinite(errors).all()):
             continue
         flags = EchoFlag(0)

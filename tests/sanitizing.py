@@ -117,7 +117,8 @@ def draw_samples(rng: np.random.Generator, n: int, s: int) -> Samples:
         counts[missing] = np.nan
     if kind == np.float32 and rng.random() < 0.05:
         counts[0, 0] = rng.choice([np.nan, np.inf])
-    return Samples(counts, baseline, std, missing)
+    level_err = std * np.float32(rng.choice([0.0, 0.1, 1.0, 1e9])) if rng.random() < 0.6 else None
+    return Samples(counts, baseline, std, missing, level_err)
 
 
 def draw_shape(rng: np.random.Generator) -> PulseShape:
@@ -162,7 +163,7 @@ def draw_settings(rng: np.random.Generator, s: int) -> Settings:
         gate_hermite=one(8.5, 0, 1e9), undamped=bool(rng.random() < 0.15), skew_mean=one(0, 0.1, 5),
         skew_spread=one(0, 0, 0.1, 1e-30, 1e9), known=one(0, 3, 3, 1e9),
         whitening=None if rng.random() < 0.6 else rng.normal(0, one(1, 1, 0, 1e9), (3, 3)),
-        thorough=bool(rng.random() < 0.6),
+        thorough=bool(rng.random() < 0.6), free_levels=bool(rng.random() < 0.7),
     )  # fmt: skip
 
 

@@ -73,11 +73,11 @@ static void print_number(double value) {
 static int run_case(const Case *c, const Strip *strip) {
     const void *samples = c->bytes == 1 ? (const void *)strip->one : c->bytes == 2 ? (const void *)strip->two
         : c->bytes == 4 ? (const void *)strip->four : (const void *)strip->real;
-    Block block = {samples, LENGTH, c->bytes, strip->level, c->per_sample, strip->std, c->missing ? strip->missing : NULL};
+    Block block = {samples, LENGTH, c->bytes, strip->level, c->per_sample, strip->std, c->missing ? strip->missing : NULL, strip->std};
     Clusters clusters = {WAVEFORMS, strip->waveform, strip->low, strip->high, strip->first, strip->number, strip->amplitude, strip->time, strip->width};
     Settings settings = {.pulse = c->pulse, .width_ref = 2, .width_low = 1, .width_high = 12, .clip = c->clip, .noise_gain = c->noise_gain,
         .floor = c->clip < INFINITY ? 0 : -INFINITY, .tolerance = 1e-2, .acceptance = 15, .misfit = 0.001, .prior_spread = c->prior_spread, .gate_residual = 4.2, .gate_hermite = 8.5,
-        .skew_mean = 0.05, .skew_spread = c->skew_spread, .max_iterations = 40, .max_echoes = 6, .grow = c->grow, .thorough = c->grow, .undamped = c->undamped,
+        .skew_mean = 0.05, .skew_spread = c->skew_spread, .max_iterations = 40, .max_echoes = 6, .grow = c->grow, .thorough = c->grow, .free_levels = c->whitened || c->noise_gain > 0, .undamped = c->undamped,
         .known = 3, .whitened = c->whitened, .whitening = {{1.7, 0, 0}, {2, -1.2, 0}, {2.2, -1.7, 0.4}}};
     static int64_t number[WAVEFORMS];
     static uint8_t converged[WAVEFORMS], at_bound[WAVEFORMS * MOST_ECHOES];

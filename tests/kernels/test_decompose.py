@@ -212,9 +212,10 @@ def draw_broad(rng):
 
 
 @pytest.mark.quick_cases(
-    "0.0-whitening0-draw_broad-inf-learned",
-    "3.0-whitening2-draw_random-inf-learned",
-    "0.0-whitening0-draw_stiff-200.0-gaussian",
+    "0.0-whitening0-None-draw_broad-inf-learned",
+    "3.0-whitening2-None-draw_random-inf-learned",
+    "0.0-whitening3-0.7-draw_random-200.0-gaussian",
+    "0.0-whitening0-None-draw_stiff-200.0-gaussian",
 )  # fmt: skip
 @pytest.mark.parametrize("shape", [GAUSSIAN, LEARNED], ids=["gaussian", "learned"])
 @pytest.mark.parametrize(
@@ -222,23 +223,28 @@ def draw_broad(rng):
     [(draw_random, np.inf), (draw_random, 200.0), (draw_stiff, np.inf), (draw_stiff, 200.0), (draw_crowd, np.inf),
      (draw_broad, np.inf)],
 )
-@pytest.mark.parametrize(("known", "whitening"), [(0.0, ()), (3.0, ()), (3.0, (1.1, -0.4))])
-def test_clusters_grow_as_those_of_the_twin(shape, draw, clip, known, whitening):
+@pytest.mark.parametrize(
+    ("known", "whitening", "level_err"),
+    [(0.0, (), None), (3.0, (), None), (3.0, (1.1, -0.4), None), (0.0, (), 0.7), (3.0, (1.1, -0.4), 0.7)],
+)
+def test_clusters_grow_as_those_of_the_twin(shape, draw, clip, known, whitening, level_err):
     rng, m = np.random.default_rng(5), {draw_crowd: 20, draw_broad: 4}.get(draw, 30)  # the twin takes long
     truth = [draw(rng) for _ in range(m)]
     y = np.stack([naive_fit.naive.model(p, np.arange(float(LENGTH)), components=shape.components) for p in truth])
     noise = rng.standard_normal(y.shape)
     if whitening:
         noise = np.linalg.solve(naive_fit.whiten(LENGTH, np.zeros(LENGTH, bool), *whitening), noise.T).T
-    y = np.minimum(np.rint(y + noise), clip)
+    y = np.minimum(np.rint(y + noise + (level_err or 0.0) * rng.standard_normal((m, 1))), clip)
     peak = y.argmax(axis=1).astype(float)
     start = np.stack([y.max(axis=1), peak, np.full(m, 2.0)], axis=1)[:, :, None]
     options = GROWING | {"shape": shape, "clip": clip if np.isfinite(clip) else None, "known": known}
     options |= {"whitening": whitening_filter(whitening)} if whitening else {}
-    found = decompose(y, start, **options)
+    found = decompose(y, start, level_err=level_err, **options)
     ends, same, near, alike = np.cumsum(found.number), 0, 0, 0
     for i in range(m):
         white = naive_fit.whiten(LENGTH, y[i] >= clip, *whitening) if whitening else None
+        if level_err is not None:
+            white = naive_fit.free_level(np.eye(LENGTH) if white is None else white, y[i] >= clip, level_err)
         twin = naive_fit.decompose(y[i], 1.0, start[i], settings(**options), clip, white, components=shape.components)
         p, errors, chi2 = twin
         if p.shape[1] != found.number[i]:

@@ -27,24 +27,26 @@ def draw(rng, m, most=6.0):
     return fitted, errors, shared
 
 
+@pytest.mark.parametrize("level", [None, 0.3])
 @pytest.mark.parametrize("most", [6.0, 60.0])
 @pytest.mark.parametrize("name", SHAPES)
-def test_the_library_keeps_and_describes_echoes_as_the_loop(name, most, rng):
+def test_the_library_keeps_and_describes_echoes_as_the_loop(name, most, level, rng):
     number = rng.choice([0, 1, 1, 1, 2, 5], 300)
     c, m = len(number), int(number.sum())
     fitted, errors, shared = draw(rng, m, most)
     solution = Solution(number, rng.random(c) < 0.9, np.zeros(c), rng.uniform(0.5, 3, m), fitted, errors, shared,
                         rng.random(m) < 0.1)  # fmt: skip
     windows = np.zeros((4, c), np.int64)
+    windows[1] = rng.integers(20, 80, c)
     clusters = Clusters(np.sort(rng.integers(0, 200, c)), *windows)
     whole = whole_pulse(SHAPES[name], LIMITS, fitted[:, 2])
     assert bool(len(whole.wide)) == (name == "learned" and most > 8)
     factors, std = rng.uniform(0.5, 1.5, (m, 4)), rng.uniform(0.5, 2, 200).astype(np.float32)
-    problem = clusters, solution, whole, factors, std, 0.5, 80, 4.5
+    problem = clusters, solution, whole, factors, std, 0.5, 80, 4.5, 15.0, None if level is None else level * std
     with np.errstate(all="ignore"):
         columns, row = keep_echoes(*problem)
         expected = naive_fit.keep(*problem)
-    assert 0.3 * m < len(row) == len(expected) < m
+    assert 0.25 * m < len(row) == len(expected) < m
     for found, wanted in zip((*columns.values(), row), zip(*expected, strict=True), strict=True):
         np.testing.assert_array_equal(found, np.array(wanted).astype(found.dtype))
     values, spreads = describe_whole(whole, fitted[:, :3], errors[:, :3], shared)

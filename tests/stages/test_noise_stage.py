@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import STAGES
+from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.detect.direct import maximum
+from wavebatch.stages.noise import pooled
+from wavebatch.stages.pulse_tables import noise_factors
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.5, std=1.1))
 
@@ -50,3 +55,34 @@ def test_levels_of_the_last_samples_scatter_by_their_errors(rng, gaps):
     block = replace(block, missing=missing) if gaps else block
     noise = STAGES["noise.tail"].function(block, replace(SYSTEM, noise=ReceiverNoise(std=1.5)), samples=20)
     assert np.std((noise.baseline - 20) / noise.baseline_err) == pytest.approx(0.93, abs=0.06)  # own noise, if larger
+
+
+@pytest.mark.parametrize("correlation", [(), (0.5, 0.25, 0.125)])
+def test_a_wrong_level_is_neither_an_echo_nor_an_amplitude(correlation):
+    """Levels scatter by the noise, and two echoes leave few quiet samples: what a level may be is not theirs."""
+    rng, m, sigma, time, x = np.random.default_rng(1), 400, 8.0, np.array([38.0, 95.0]), np.arange(135)
+    height = np.exp(rng.uniform(np.log(15), np.log(70), (m, 2)))
+    noise = rng.standard_normal((m, len(x)))
+    for i in range(1, len(x) if correlation else 0):
+        noise[:, i] = 0.5 * noise[:, i - 1] + np.sqrt(0.75) * noise[:, i]
+    y = 20 + rng.standard_normal((m, 1)) + noise
+    y += (height[:, :, None] * np.exp(-0.5 * ((x - time[:, None]) / sigma) ** 2)).sum(axis=1)
+    block = WaveformBlock.from_samples(np.rint(y).astype(np.uint16))
+    std = 1.04 * noise_factors(GAUSSIAN, sigma, correlation)[0]
+    known = ReceiverNoise(
+        baseline=20.0, baseline_spread=1.0, std=std, by_kind={"quiet": 1.04}, correlation=correlation,
+        whitening=(0.5, 0.0) if correlation else (),
+    )  # fmt: skip
+    found = []
+    for free_levels in (False, True):
+        system = SystemPulse(sigma, noise=known)
+        levels = pooled(block, system)
+        echoes = adaptive(block, levels, system, maximum(block, levels, system), free_levels=free_levels)
+        away = np.abs(echoes.time[:, None] - time)
+        near = away.min(axis=1) < 4
+        off = echoes.amplitude[near] - height[echoes.waveform[near], away.argmin(axis=1)[near]]
+        within = np.mean(np.abs(off) < echoes.amplitude_err[near])
+        found.append((np.count_nonzero(~near), np.sqrt(np.mean(off**2)), within, np.count_nonzero(near)))
+    (false, scatter, _, _), (left, rest, within, number) = found
+    assert left < 0.4 * false and rest < (0.9 if correlation else 0.5) * scatter
+    assert 0.6 < within < 0.8 and number >= 0.99 * 2 * m

@@ -59,7 +59,7 @@ class CSettings(ctypes.Structure):
             "width_ref width_low width_high clip floor noise_gain tolerance acceptance misfit prior_spread "
             "gate_residual gate_hermite known skew_mean skew_spread",
         ),
-        *_fields(ctypes.c_int64, "max_iterations max_echoes grow thorough undamped whitened"),
+        *_fields(ctypes.c_int64, "max_iterations max_echoes grow thorough free_levels undamped whitened"),
         ("whitening", ctypes.c_double * 9),
     ]
 
@@ -72,7 +72,7 @@ class Block(ctypes.Structure):
         *_fields(ctypes.c_int64, "length bytes"),
         *_fields(_POINTER, "baseline"),
         *_fields(ctypes.c_int64, "baseline_per_sample"),
-        *_fields(_POINTER, "std missing"),
+        *_fields(_POINTER, "std missing level_err"),
     ]
 
 
@@ -181,7 +181,7 @@ class CWhole(ctypes.Structure):
 class CKeeping(ctypes.Structure):
     """`Keeping` of kernels/c/echoes.h."""
 
-    _fields_ = [*_fields(_POINTER, "std factors"), *_fields(ctypes.c_double, "spacing last significance")]
+    _fields_ = [*_fields(_POINTER, "std level_err factors"), *_fields(ctypes.c_double, "spacing last significance acceptance")]
 
 
 class CTable(ctypes.Structure):
@@ -259,13 +259,15 @@ class Samples(NamedTuple):
     """Noise of each waveform, float32 (n,) [count]."""
     missing: np.ndarray | None = None
     """Samples that were not recorded, bool (n, s); None where there is none."""
+    level_err: np.ndarray | None = None
+    """Standard deviation of the error of each level, float32 (n,) [count]; None where they are not known."""
 
     def checked(self, *, finite: bool = True) -> Samples:
         """The same as the library reads it; raises ValueError where it would read outside of the arrays.
 
         finite: values must be, for arithmetic; comparisons need only the shapes.
         """
-        counts, baseline, std, missing = self
+        counts, baseline, std, missing, level_err = self
         n, s = counts.shape
         if counts.dtype not in (np.uint8, np.uint16, np.uint32, np.float32):
             raise ValueError(f"samples of type {counts.dtype} cannot be read")
@@ -273,26 +275,32 @@ class Samples(NamedTuple):
             raise ValueError(f"levels or noise do not have the shape of {n} waveforms of {s} samples")
         if missing is not None and missing.shape != (n, s):
             raise ValueError(f"gaps do not have the shape of {n} waveforms of {s} samples")
+        if level_err is not None and level_err.shape != (n,):
+            raise ValueError(f"errors of levels do not have the shape of {n} waveforms")
         if finite:
             self._check_values()
         flat = (np.ascontiguousarray(baseline, np.float32), np.ascontiguousarray(std, np.float32))
         gaps = None if missing is None else np.ascontiguousarray(missing, np.bool_)
-        return Samples(np.ascontiguousarray(counts), *flat, gaps)
+        errors = None if level_err is None else np.ascontiguousarray(level_err, np.float32)
+        return Samples(np.ascontiguousarray(counts), *flat, gaps, errors)
 
     def _check_values(self) -> None:
-        counts, baseline, std, missing = self
+        counts, baseline, std, missing, level_err = self
         if not (np.isfinite(baseline).all() and np.isfinite(std).all() and (std > 0).all()):
             raise ValueError("levels and noise must be finite, and the noise above 0")
+        if level_err is not None and not np.isfinite(level_err).all():
+            raise ValueError("errors of levels must be finite")
         if counts.dtype == np.float32 and not np.isfinite(counts if missing is None else counts[~missing]).all():
             raise ValueError("samples must be finite where they are not missing")
 
     def as_block(self) -> Block:
         """The structure, which points into these arrays."""
-        counts, baseline, std, missing = self
+        counts, baseline, std, missing, level_err = self
         kind = 0 if counts.dtype == np.float32 else counts.dtype.itemsize
         block = Block(
             address(counts), counts.shape[1], kind, place(baseline, np.float32), baseline.ndim - 1,
             place(std, np.float32), None if missing is None else place(missing, np.bool_),
+            None if level_err is None else place(level_err, np.float32),
         )  # fmt: skip
         block.arrays = self  # they must live as long as the structure
         return block

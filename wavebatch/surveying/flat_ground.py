@@ -323,7 +323,7 @@ def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
     """
     block = sample.block
     system = replace(system.of(block), widths=LevelWidths())
-    echoes = decompose_sample(block, system)
+    echoes = decompose_sample(block, system, free_levels=True)
     echoes = echoes.take(np.flatnonzero(find_single(echoes, len(block), system)))
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform

@@ -291,7 +291,7 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     middle = block.spacing * (0.5 * length + rng.random(n))
     time = np.stack([middle - half, middle + half], axis=1)
     pairs = EchoTable.build(np.repeat(np.arange(n), 2), time.ravel(), echoes.amplitude[chosen], echoes.sigma[chosen])
-    found = decompose_sample(*simulate_again(block, system, pairs, rng, length))
+    found = decompose_sample(*simulate_again(block, system, pairs, rng, length), free_levels=True)
     one = found.alone(n) & (found.amplitude > CLEAR * system.noise.std)
     found = found.take(np.flatnonzero(one))
     away = np.abs(time[found.waveform] - found.time[:, None])

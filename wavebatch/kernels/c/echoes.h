@@ -4,6 +4,7 @@
    stages/pulse_tables.py has the tables and their reasons. */
 
 enum { AS_FITTED, STRETCHED, SUMMED };         /* how the pulse widens: parameters are those of the echo, or need tables */
+static const double LEAST_LEVEL = 5;           /* widths of an echo that show a level at least: its flanks still tell it from one */
 enum { FLAG_NOT_CONVERGED = 1, FLAG_AT_BOUND = 2, FLAG_OVERLAPPED = 16 };
 
 typedef struct { /* a pulse by its fitted width; a row has the peak, its slope by the width, sigma, and its slope */
@@ -14,8 +15,10 @@ typedef struct { /* a pulse by its fitted width; a row has the peak, its slope b
 
 typedef struct { /* what fits become echoes */
     const float *std;                          /* noise of each waveform */
+    const float *level_err;                    /* of the level of each waveform, where fits left it free; or NULL */
     const double *factors;                     /* on the errors of amplitude, time, sigma and energy of each echo */
-    double spacing, last, significance;        /* last sample of a waveform; least energy of an echo, in noise */
+    double spacing, last, significance, acceptance; /* last sample of a waveform; least energy of an echo, in noise; and of
+                                                  what no error of the level explains, in its square */
 } Keeping;
 
 typedef struct { /* core columns of a table of m echoes, and the row of each among the fitted ones */
@@ -70,13 +73,19 @@ EXPORT int64_t keep_echoes(const Clusters *clusters, const Echoes *fits, const W
         const int64_t waveform = clusters->waveform[c];
         const uint16_t common = (fits->converged[c] ? 0 : FLAG_NOT_CONVERGED) | (fits->number[c] > 1 ? FLAG_OVERLAPPED : 0);
         const float noise = (float)keeping->significance * keeping->std[waveform];
+        const double std = keeping->std[waveform], level = keeping->level_err ? keeping->level_err[waveform] / std : 0;
         for (int64_t i = 0; i < fits->number[c]; i++, row++) {
             const double *fitted = fits->parameters + 4 * row, *error = fits->errors + 4 * row, *shared = fits->shared + 2 * row;
             const double *factor = keeping->factors + 4 * row, a = error[0] / fitted[0], w = error[2] / fitted[2];
             double value[3], errors[3];
             describe_echo(whole, fitted, error, shared, value, errors);
             for (int k = 0; k < 3; k++) errors[k] *= factor[k];
-            const double energy = value[0] * value[0] * value[2] * 1.7724538509055159; /* the root of pi */
+            const double square = value[0] * value[0] * value[2], energy = square * 1.7724538509055159; /* the root of pi */
+            if (level > 0) { /* an error of the level explains its share of the squared sum of the samples */
+                const double length = fmax(clusters->high[c] - clusters->low[c], LEAST_LEVEL * value[2]);
+                const double share = level * level / (1 + level * level * length), sum = 6.283185307179586 * square * value[2]; /* 2 pi */
+                if (energy - share * sum < keeping->acceptance * std * std) continue;
+            }
             if (!(energy >= noise * noise && value[1] >= -0.5 * value[2] && value[1] <= keeping->last + 0.5 * value[2])) continue;
             if (!isfinite(errors[0]) || !isfinite(errors[1]) || !isfinite(errors[2])) continue;
             out->waveform[kept] = (int32_t)waveform;

@@ -56,6 +56,7 @@ INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work,
         for (int64_t i = 0; i <= per * k; i++) work->rows[i * n + v] *= weight;
     }
     for (int64_t i = 0; i <= per * k && w->is_whitened; i++) whiten(w, work->rows + i * n);
+    for (int64_t i = 0; i <= per * k && w->level_share > 0; i++) take_level_off(w, work->rows + i * n);
 }
 
 /* The same to the same bits where rows are long: a sum waits for each of its additions, so there are eight at a time. */

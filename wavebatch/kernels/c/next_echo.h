@@ -262,12 +262,18 @@ static double propose_echo(const Settings *s, Work *work, const Fit *fit, const 
     const int64_t k = fit->k, p = 3 * k, n = w->vectors;
     lanes *onto = work->about + p * n;
     for (int64_t i = 0; i <= p; i++) {
+        if (w->level_share > 0) take_level_off(w, work->rows + i * n); /* once more: new pulses keep their share of it */
         if (w->is_whitened) filter_back(w, work->rows + i * n, work->back);
         correlate(work, w->is_whitened ? work->back : work->rows + i * n, work->taps, work->about + i * n);
     }
     for (int64_t v = 0; v < n; v++) work->rows[v] = pick(w->x[v] >= 0.f, ALL(1), ALL(0)); /* the pulses are not needed any more */
     if (w->is_whitened) memcpy(work->energy, work->new_energy, n * sizeof(lanes));
     else correlate(work, work->rows, work->taps + work->reach + 1, work->energy);
+    if (w->level_share > 0) {
+        if (w->is_whitened) filter_back(w, w->level, work->back);
+        correlate(work, w->is_whitened ? work->back : w->level, work->taps, work->rows);
+        for (int64_t v = 0; v < n; v++) work->energy[v] -= work->rows[v] * work->rows[v] * (float)(2 - w->level_share);
+    }
     float most = 0, *left = (float *)work->energy;
     for (int64_t i = 0; i < w->n; i++) most = left[i] > most ? left[i] : most;
     project_out(work, fit, work->energy, onto);

@@ -27,7 +27,7 @@ typedef struct {
     double gate_residual, gate_hermite;        /* of the residual test, 4.2 */
     double known;                              /* errors that an amplitude needs beside other echoes; 0: it is not asked */
     double skew_mean, skew_spread;             /* of free skews; spread 0: skews are not free */
-    int64_t max_iterations, max_echoes, grow, thorough, undamped, whitened;
+    int64_t max_iterations, max_echoes, grow, thorough, free_levels, undamped, whitened;
     double whitening[3][3];                    /* row q: coefficients of a sample, and of those before it, after q others */
 } Settings;
 
@@ -39,6 +39,7 @@ typedef struct { /* n waveforms of `length` samples */
     int64_t baseline_per_sample;
     const float *std;                          /* noise of each waveform */
     const uint8_t *missing;                    /* true where no sample was recorded; or NULL */
+    const float *level_err;                    /* of the level of each waveform; or NULL */
 } Block;
 
 typedef struct { /* candidates that are fitted together, each cluster in its window low .. high - 1 of a waveform */

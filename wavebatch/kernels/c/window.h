@@ -75,6 +75,32 @@ static void filter_back(const Window *w, const lanes *row, lanes *out) {
     for (int64_t v = 0; v < w->vectors && w->is_weighted; v++) out[v] *= w->weight[v];
 }
 
+/* Takes off a row what an error of the level may be of it. */
+INLINE void take_level_off(const Window *w, lanes *row) {
+    lanes sum = ALL(0);
+    for (int64_t v = 0; v < w->vectors; v++) sum += row[v] * w->level[v];
+    const float share = sum_lanes(sum);
+    for (int64_t v = 0; v < w->vectors; v++) row[v] -= w->level[v] * share;
+}
+
+/* An error of the level is noise of the covariance u u' error^2, where u is the whitened row of ones. The root of the
+   inverse of that and white noise is I - l l', with l along u. Clipped samples are known from nothing. */
+static void free_level(double error, Window *w) {
+    lanes sum = ALL(0);
+    for (int64_t v = 0; v < w->vectors; v++) {
+        w->level[v] = pick(w->x[v] >= 0.f, ALL(1), ALL(0));
+        if (w->any_clipped) w->level[v] = pick(w->clipped[v] != 0.f, ALL(0), w->level[v]);
+        if (w->is_weighted) w->level[v] *= w->weight[v];
+    }
+    if (w->is_whitened) whiten(w, w->level);
+    for (int64_t v = 0; v < w->vectors; v++) sum += w->level[v] * w->level[v];
+    const double square = sum_lanes(sum);
+    if (!(square > 0)) return;
+    w->level_share = 1 - 1 / sqrt(1 + error * error * square / (w->std * w->std));
+    const float scale = sqrt(w->level_share / square);
+    for (int64_t v = 0; v < w->vectors; v++) w->level[v] *= scale;
+}
+
 /* Cuts samples low .. high - 1 of a waveform, above its baseline. */
 static void cut_window(const Block *block, const Settings *s, int64_t waveform, int64_t low, int64_t high, Window *w) {
     float *y = (float *)w->y, *x = (float *)w->x, *clipped = (float *)w->clipped;
@@ -93,4 +119,6 @@ static void cut_window(const Block *block, const Settings *s, int64_t waveform, 
     if (w->is_weighted) weigh(w, s->noise_gain);
     w->is_whitened = s->whitened;
     if (w->is_whitened) set_filter(s, w);
+    w->level_share = 0;
+    if (s->free_levels && block->level_err && block->level_err[waveform] > 0) free_level(block->level_err[waveform], w);
 }

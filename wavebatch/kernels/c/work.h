@@ -6,6 +6,8 @@ typedef struct { /* samples of one cluster, padded to whole vectors */
     lanes *y, *x;                              /* signal; position, OUTSIDE where there is no sample */
     lanes *clipped, *weight;                   /* 1 where clipped, -1 at the floor; noise without signal over noise */
     lanes *filter;                             /* where noise is whitened: coefficients of samples i, i - 1, i - 2; (3, vectors) */
+    lanes *level;                              /* what an error of the level looks like: rows lose their share of it */
+    double level_share;                        /* its square; 0 where the level is known */
     int any_clipped, is_weighted, is_whitened;
 } Window;
 
@@ -59,7 +61,7 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
     size_t row = vectors * sizeof(lanes), p = 4 * k + 1, number = sizeof(double);
     size_t padded = row + 2 * (VECTORS(w->reach) + 4) * sizeof(lanes);
     int good = enlarge(&w->window.y, row) && enlarge(&w->window.x, row) && enlarge(&w->window.clipped, row)
-        && enlarge(&w->window.weight, row) && enlarge(&w->window.filter, 3 * row) && enlarge(&w->back, row)
+        && enlarge(&w->window.weight, row) && enlarge(&w->window.filter, 3 * row) && enlarge(&w->window.level, row) && enlarge(&w->back, row)
         && enlarge(&w->new_energy, row) && enlarge(&w->rows, p * row) && enlarge(&w->about, p * row)
         && enlarge(&w->padded, padded) && enlarge(&w->coarse, row) && enlarge(&w->energy, row)
         && enlarge(&w->fit.parameters, p * number) && enlarge(&w->fit.gram, p * p * number) && enlarge(&w->next.parameters, p * number)
@@ -75,7 +77,7 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
 }
 
 static void free_work(Work *w) {
-    void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->back, w->new_energy, w->rows, w->about, w->padded, w->coarse, w->energy,
+    void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->window.level, w->back, w->new_energy, w->rows, w->about, w->padded, w->coarse, w->energy,
         w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
         w->known, w->frozen, w->taps, w->edges, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
         w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound,

@@ -118,6 +118,8 @@ class Settings(NamedTuple):
     """Whether echoes are added where the residual shows more than noise."""
     thorough: bool = False
     """Whether missed echoes are searched again, and one broad echo may stand for several (docs/algorithms.md 2.3)."""
+    free_levels: bool = False
+    """Whether levels are known only to their errors (docs/algorithms.md H10)."""
     acceptance: float = 15.0
     """Smallest fall of chi2 for which an echo is added (docs/algorithms.md 2.3)."""
     misfit: float = 0.0
@@ -380,6 +382,8 @@ def keep_echoes(
     spacing: float,
     length: int,
     significance: float,
+    acceptance: float = 0.0,
+    level_err: np.ndarray | None = None,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Echoes of fits that noise does not explain and that lie in their waveform, as columns of a table.
 
@@ -399,6 +403,10 @@ def keep_echoes(
         Samples of a waveform.
     significance : float
         Least energy of an echo [standard deviations].
+    acceptance : float
+        Least energy of what an error of the level does not explain of it [squared standard deviations].
+    level_err : float32 (n,), optional
+        Standard deviations of the levels that fits left free [count]; None where they took them as known.
 
     Returns
     -------
@@ -409,7 +417,8 @@ def keep_echoes(
     """
     m, n = len(solution.parameters), len(solution.number)
     factors, std = np.ascontiguousarray(factors, np.float64), np.ascontiguousarray(std, np.float32)
-    waveform = np.ascontiguousarray(clusters.waveform, np.int64)
+    level_err = None if level_err is None else np.ascontiguousarray(level_err, np.float32)
+    waveform, low, high = (np.ascontiguousarray(column, np.int64) for column in clusters[:3])
     fits: list[np.ndarray] = [
         np.ascontiguousarray(column, kind) for column, kind in zip(solution, _SOLUTION, strict=True)
     ]
@@ -420,9 +429,12 @@ def keep_echoes(
         raise ValueError("a cluster lies in no waveform")
     columns = {name: np.empty(m, kind) for name, kind in (COLUMNS | {"row": np.int64}).items()}
     kept = call(
-        "keep_echoes", library.CClusters(n, library.address(waveform)),
+        "keep_echoes", library.CClusters(n, library.address(waveform), library.address(low), library.address(high)),
         library.Echoes(m, *map(library.address, fits)), whole.as_structure(fits[4][:, 2]),
-        library.CKeeping(library.address(std), library.address(factors), spacing, length - 1, significance),
+        library.CKeeping(
+            library.address(std), None if level_err is None else library.address(level_err), library.address(factors),
+            spacing, length - 1, significance, acceptance,
+        ),
         library.CTable(m, *map(library.address, columns.values())),
     )  # fmt: skip
     found = {name: column[:kept] for name, column in columns.items()}

@@ -143,6 +143,7 @@ def adaptive(
     acceptance: Annotated[float, Range(0.0, 1e6)] = 0.0,
     max_echoes: Annotated[int, Range(1, 1000)] = 8,
     thorough: bool = True,
+    free_levels: bool = True,
     gate_residual: Annotated[float, Range(0.0, 1e6)] = 4.2,
     gate_hermite: Annotated[float, Range(0.0, 1e6)] = 8.5,
     width_prior: Annotated[float, Range(0.0, 100.0)] = 0.1,
@@ -163,6 +164,8 @@ def adaptive(
     thorough : bool
         Whether echoes are searched again where a fit leaves so much that it must have missed some, and one echo broader
         than `most_width` is taken where several explain no more.
+    free_levels : bool
+        Whether the level of each waveform is known only to its error, so that no echo makes up for a wrong one.
     gate_residual : float
         Largest smoothed residual of a complete fit [standard deviations].
     gate_hermite : float
@@ -173,7 +176,7 @@ def adaptive(
 
     References
     ----------
-    docs/algorithms.md 2.3, 4.2, H1, H3.
+    docs/algorithms.md 2.3, 4.2, H1, H3, H10.
     """
     fit = replace(_ADAPTIVE, **options)
     shape = pulse_shape(system, block.spacing)
@@ -184,6 +187,7 @@ def adaptive(
         fit,
         grow=True,
         thorough=thorough,
+        free_levels=free_levels,
         acceptance=acceptance or system.acceptance,
         misfit=max(fit_misfit(system, block.spacing), SINGLE_PRECISION),
         max_echoes=max_echoes,

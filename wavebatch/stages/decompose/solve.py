@@ -53,7 +53,6 @@ PLATEAU_SLACK = 2
 MOST_JOINED = 6
 """A run of signal with more candidates is fitted in parts."""
 
-
 def find_clusters(
     block: WaveformBlock,
     noise: Noise,
@@ -431,12 +430,15 @@ def describe_solution(
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     fitted = system if settings.shape.components else replace(system, components=(), kappa=settings.shape.kappa)
     spacing, length, widths = block.spacing, block.samples.shape[1], solution.parameters[:, 2]
-    level_err = None
-    if noise.baseline_err is not None:
-        level_err = (noise.baseline_err / noise.std)[np.repeat(clusters.waveform, solution.number)]
-    factors = error_factors(fitted, spacing, widths, level_err)
+    # Errors of levels are in the errors of fits that left them free, else in factors.
+    free, beside = (noise.baseline_err, None) if settings.free_levels else (None, noise.baseline_err)
+    if beside is not None:
+        beside = (beside / noise.std)[np.repeat(clusters.waveform, solution.number)]
+    factors = error_factors(fitted, spacing, widths, beside)
     whole = whole_pulse(settings.shape, limits, widths)
-    columns, row = decompose.keep_echoes(clusters, solution, whole, factors, noise.std, spacing, length, significance)
+    columns, row = decompose.keep_echoes(
+        clusters, solution, whole, factors, noise.std, spacing, length, significance, settings.acceptance, free
+    )
     proves = bool(settings.shape.components) or not system.components
     steps = flagging(block, system)._replace(
         sort=True, gaps=spacing, twins=TWINS, overlap=OVERLAP, unresolved=UNRESOLVED, lone=True,

@@ -87,10 +87,10 @@ def samples_of(block: WaveformBlock, noise: Noise) -> Samples:
     Returns
     -------
     Samples
-        Raw counts with their levels.
+        Raw counts with their levels and what is known of their errors.
     """
     levels = noise.baseline if noise.of_sample is None else noise.of_sample
-    return Samples(block.samples, levels, noise.std, block.missing)
+    return Samples(block.samples, levels, noise.std, block.missing, noise.baseline_err)
 
 
 def make_table(

@@ -96,7 +96,7 @@ def find_compression(reader: StripReader, scan: StripScan, system: SystemPulse) 
 def _describe(block: WaveformBlock, system: SystemPulse) -> Iterator[tuple[int, np.ndarray]]:
     """Channels, and of their lone echoes f8 (3, k): amplitude, share of the squared echo that is missing, and the light
     that goes with that."""
-    echoes = decompose_sample(block, system)
+    echoes = decompose_sample(block, system, free_levels=True)
     echoes = echoes.take(np.flatnonzero(find_single(echoes, len(block), system)))
     if not len(echoes):
         return

@@ -50,8 +50,9 @@ SURE = 3.0
 KNOWN, LEAST_KNOWN = 0.15, 10
 """Largest error of a width that tells of the density of widths, as a share of it; fewest widths that do."""
 
-SEARCH: dict[str, Any] = {"max_echoes": 6, "thorough": False}
-"""How far fits of a survey look for echoes: one that explains all with ever more of them hides what a pulse misses."""
+SEARCH: dict[str, Any] = {"max_echoes": 6, "thorough": False, "free_levels": False}
+"""How far fits of a survey look for echoes: one that explains all with ever more of them hides what a pulse misses.
+Levels are known: what fits leave is measured against them."""
 
 _DOUBTFUL = np.uint16(EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED | EchoFlag.MERGED)
 

@@ -82,9 +82,12 @@ def find_echoes(
     return block, noise, adaptive(block, noise, system, detect(block, noise, system), **options)
 
 
-def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """Decompose waveforms as a run does; errors hold the noise as fits see it."""
-    return use_noise_errors(find_echoes(block, system)[2], system, block.spacing)
+def decompose_sample(block: WaveformBlock, system: SystemPulse, *, free_levels: bool = False) -> EchoTable:
+    """Decompose waveforms as a run does; errors hold the noise as fits see it.
+
+    What fits leave is measured against levels as they are known, so fits take them so; free_levels: as a run does.
+    """
+    return use_noise_errors(find_echoes(block, system, free_levels=free_levels)[2], system, block.spacing)
 
 
 def decompose_again(block: WaveformBlock, system: SystemPulse, before: SystemPulse, echoes: EchoTable) -> EchoTable:

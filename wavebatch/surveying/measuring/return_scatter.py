@@ -126,7 +126,7 @@ def _compare(
     block: WaveformBlock, returns: ReturnTable, run: np.ndarray, system: SystemPulse
 ) -> tuple[np.ndarray, ...]:
     """The same of one block; run: of each waveform (n,). Only waveforms of one run are neighbours."""
-    echoes = decompose_sample(block, system)
+    echoes = decompose_sample(block, system, free_levels=True)
     match = match_returns(echoes.waveform, echoes.time, returns.waveform, returns.time, REACH + 0.5 * block.spacing)
     clear = (match >= 0) & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.WEAK)) == 0) & (echoes.time_err > 0)
     rows = np.flatnonzero(clear)
