@@ -181,7 +181,10 @@ class CWhole(ctypes.Structure):
 class CKeeping(ctypes.Structure):
     """`Keeping` of kernels/c/echoes.h."""
 
-    _fields_ = [*_fields(_POINTER, "std level_err factors"), *_fields(ctypes.c_double, "spacing last significance acceptance")]
+    _fields_ = [
+        *_fields(_POINTER, "std level_err factors"),
+        *_fields(ctypes.c_double, "spacing last significance acceptance"),
+    ]
 
 
 class CTable(ctypes.Structure):
