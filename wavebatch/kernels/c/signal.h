@@ -266,7 +266,7 @@ static int64_t group_waveform(const Grouping *g, int64_t s, int64_t waveform, in
                               const int64_t *high, Groups *out, int64_t number) {
     int64_t furthest = 0, run = 0, before = -1;
     for (int64_t j = i; j < end; j++) {
-        int joined = j > i && low[j] < furthest;
+        int joined = j > i && (low[j] < furthest || at[j] - at[j - 1] < g->reach);
         run = joined ? run + 1 : 0;
         if (!joined || run % g->most == 0) {
             int64_t first = low[j] - g->margin < at[j] - g->reach ? low[j] - g->margin : at[j] - g->reach;
