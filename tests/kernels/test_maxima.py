@@ -139,7 +139,7 @@ def naive_clusters(samples, candidates, margin, reach, most, tail):
             extents.append((low, max(high, place + (tail[i] if tail is not None else 0))))
         furthest, parts = 0, []
         for k, (low, high) in enumerate(extents):
-            if k and low < furthest and len(parts[-1]) < most:
+            if k and (low < furthest or at[k] - at[k - 1] < reach) and len(parts[-1]) < most:
                 parts[-1].append(k)
             else:
                 parts.append([k])

@@ -84,3 +84,17 @@ def test_an_echo_alone_that_its_neighbour_explains_is_left_out():
     found = find(block, replace(SYSTEM, beside=((-40.0, 900.0), (40.0, 900.0))))
     assert (found.count(N) == 1).mean() > 0.95 and (found.amplitude >= found.amplitude_err).all()
     assert (find(block).count(N) == 2).mean() > 0.95
+
+
+def test_noise_that_cuts_a_broad_faint_echo_makes_no_two():
+    """It may have two maxima with a gap between their runs: 4 % were two echoes, narrow and at the bound."""
+    rng, n, x = np.random.default_rng(1), 1000, np.arange(160)
+    height, place = np.exp(rng.uniform(np.log(1.8), np.log(6), (n, 1))), 80 + rng.random((n, 1))
+    y = 20 + 2 * (height * np.exp(-0.5 * ((x - place) / 7) ** 2) + rng.standard_normal((n, 160)))
+    system = SystemPulse(7.0, noise=ReceiverNoise(baseline=20.0, std=2.02))
+    block = WaveformBlock.from_samples(np.rint(y).astype(np.uint16))
+    noise = pooled(block, system)
+    found = maximum(block, noise, system)
+    assert np.count_nonzero(found.count(n) > 1) > 80
+    number = find(block, system).count(n)
+    assert np.count_nonzero(number > 1) < 5 and np.count_nonzero(number == 0) < 5

@@ -261,7 +261,8 @@ static void find_extents(int64_t s, const float *smoothed, float level, int64_t 
         if (at[i] + tail[i] > high[i]) high[i] = at[i] + tail[i];
 }
 
-/* Candidates i .. end - 1 of one waveform as clusters, whose windows do not overlap; returns the number of clusters. */
+/* Candidates i .. end - 1 of one waveform as clusters, whose windows do not overlap; returns the number of clusters. Those
+   closer than an echo reaches are fitted together where noise cuts their run: faint broad echoes may have two maxima. */
 static int64_t group_waveform(const Grouping *g, int64_t s, int64_t waveform, int64_t i, int64_t end, const int64_t *at, const int64_t *low,
                               const int64_t *high, Groups *out, int64_t number) {
     int64_t furthest = 0, run = 0, before = -1;
