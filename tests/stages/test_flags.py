@@ -133,6 +133,15 @@ def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(tab
         assert 10 < len(dropped) < len(table) // 2
 
 
+def test_all_of_a_long_ringing_is_of_the_echo_before_it():
+    """Its far parts are explained by the strong echo, though more of them lie between than neighbours are looked at."""
+    time, height = 10 + 4.0 * np.arange(12), np.r_[5000, np.full(11, 10.0)]
+    lags = tuple((lag, 0.0018) for lag in (time - 10)[1:].tolist())
+    table = EchoTable.build(np.zeros(12, int), time, height, np.full(12, 2.0), amplitude_err=np.full(12, 0.5))
+    rest, _, _ = finish(table, unproven=unproven(SystemPulse(2.0, tail_misfit=lags)))
+    assert rest.time.tolist() == [10.0]
+
+
 @pytest.mark.parametrize(
     ("misfit", "beside"), [(0.05, ()), (0.0, ((-8.0, 0.5), (6.0, 3.0), (8.0, 2.0))), (0.05, ((8.0, 5.0),))]
 )

@@ -60,13 +60,18 @@ static int is_faint(const Table *t, const Faintness *f, int64_t row, int64_t oth
     return amplitude < fmax((fabs(lag) < f->beside ? f->factor : f->far_factor) * tail, tail + sure);
 }
 
-/* Marks echoes that an error of another one of their waveform explains. */
+/* Marks echoes that an error of another one of their waveform explains: of the nearest, and of the last ones before it that
+   nothing explains, as many echoes of a ringing may lie between it and the strong one. */
 static void find_faint(const Table *t, const Faintness *f, uint8_t *faint) {
+    int64_t last[NEIGHBOURS], kept = 0;
     for (int64_t i = 0, end = 0; i < t->m; i++) {
         faint[i] = 0;
-        if (i == end) end = end_of_waveform(t, i);
+        if (i == end) { end = end_of_waveform(t, i); kept = 0; }
         for (int64_t j = i > NEIGHBOURS ? i - NEIGHBOURS : 0; j < end && j <= i + NEIGHBOURS && !faint[i]; j++)
             if (j != i && t->waveform[j] == t->waveform[i]) faint[i] = is_faint(t, f, i, j);
+        for (int64_t k = 0; k < kept && k < NEIGHBOURS && !faint[i]; k++)
+            if (last[k] < i - NEIGHBOURS) faint[i] = is_faint(t, f, i, last[k]);
+        if (!faint[i]) last[kept++ % NEIGHBOURS] = i;
     }
 }
 
