@@ -7,7 +7,7 @@ import pytest
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.point_filter import EVERY, REASONS, PointFilter
-from wavebatch.files.geojson import Polygon
+from wavebatch.files.geojson import Polygon, find_inside
 
 ROWS = {
     "x": np.array([0.0, 1.0, 2.0, 3.0, 4.0, np.nan]),
@@ -60,6 +60,14 @@ def test_the_first_reason_counts(chosen, expected):
 def test_points_lie_in_one_of_the_polygons():
     squares = [Polygon("", (np.array([(x, -1.0), (x + 1.5, -1.0), (x + 1.5, 1.0), (x, 1.0)]),)) for x in (0.5, 2.5)]
     assert reasons(PointFilter(polygons=tuple(squares))) == ["polygon", "", "polygon", "", "polygon", "polygon"]
+
+
+def test_a_point_on_the_border_of_two_polygons_lies_in_one_of_them():
+    low, high = (np.array([(0.0, y), (1.0, y), (1.0, y + 1), (0.0, y + 1)]) for y in (0.0, 1.0))
+    left, beside = low - [1.0, 0.0], low + [1.0, 0.0]
+    x, y = np.array([0.0, 1.0, 0.5]), np.array([0.5, 0.5, 1.0])
+    found = np.stack([find_inside([ring], x, y) for ring in (left, low, beside, high)])
+    assert found.sum(axis=0).tolist() == [1, 1, 1]
 
 
 def test_columns_that_are_missing_are_named():

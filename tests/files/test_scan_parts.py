@@ -107,6 +107,16 @@ def test_packets_whose_points_lie_further_apart_than_the_window_are_suspect():
         assert near.suspects()[0] == is_suspect
 
 
+def test_parts_of_a_scan_are_joined_from_the_first_to_the_last_point_of_each_bin():
+    parts = [scanner.NearSharing(0, 1024, Spool(2, np.dtype("u1")), ScanSizes(window=10, bins=1)) for _ in range(2)]
+    for near, index in zip(parts, (0, 10), strict=True):
+        key, own = np.zeros(1, np.uint64), np.ones(1, bool)
+        near.add(key, np.array([index]), np.zeros(1, int), own, lambda rows: np.empty(len(rows), "u1"))
+        assert not near.suspects()[0]
+    parts[0].join(parts[1])
+    assert parts[0].suspects()[0]
+
+
 def test_a_part_of_few_points_before_a_border_is_not_cut_off(strip):
     with open_strip(strip) as reader:
         units = reader.unit_count()

@@ -13,7 +13,7 @@ from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.kernels.physics.radiometry import receive_power
-from wavebatch.stages.attribute.radiometry import echo_light
+from wavebatch.stages.attribute.radiometry import echo_light, hide_edges
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step, load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
 from wavebatch.surveying.flat_ground import SLOPE, predict_angles
@@ -480,3 +480,18 @@ def test_only_echoes_alone_have_a_reflectance_and_an_angle():
     assert (done["level_reflectance_reason"] == NoData.SHARED_PULSE).all() and np.isfinite(done["cross_section"]).all()
     done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"alone": False}).attributes
     assert np.isfinite(done["incidence_angle"]).all()
+
+
+def test_level_reflectances_at_edges_are_left_out_with_the_reason():
+    """Those that are no data already keep their reason."""
+    name = "level_reflectance"
+    columns = {name: [0.3, 0.4, np.nan, 0.5], f"{name}_err": [0.01, 0.02, np.nan, 0.03]}
+    columns = {key: np.array(values, np.float32) for key, values in columns.items()}
+    columns[f"{name}_reason"] = np.array([0, 0, NoData.TOO_STEEP, 0], np.uint8)
+    table = EchoTable.build(np.arange(4), np.full(4, 5.0), np.full(4, 9.0), np.ones(4)).with_attributes(
+        edge=np.array([True, False, True, True]), **columns
+    )
+    found = hide_edges(table).attributes
+    assert found[f"{name}_reason"].tolist() == [NoData.EDGE, 0, NoData.TOO_STEEP, NoData.EDGE]
+    for key in (name, f"{name}_err"):
+        assert np.isnan(found[key]).tolist() == [True, False, True, True] and found[key][1] == columns[key][1]

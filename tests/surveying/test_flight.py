@@ -91,6 +91,17 @@ def test_a_stranger_does_not_give_a_descriptor_its_meaning(strips):
     assert [strip.path for strip in found.misfits] == [strips["other"]] and found.saved.survey.waveforms == 660
 
 
+def test_a_strip_that_lacks_a_descriptor_has_a_vote_in_the_others(strips):
+    """Descriptor 2 is decided first; a strip that has none says what descriptor 1 means."""
+    samples = []
+    for name, index, gain in ("flat", 2, 1.0), ("urban", 2, 1.0), ("forest", 1, 2.0):
+        (sample,) = read_samples([strips[name]], waveforms=300)
+        block = sample.blocks[0]
+        block = replace(block, digitizer=replace(block.digitizer, index=index, gain=gain))
+        samples.append(replace(sample, blocks=(block,)))
+    assert survey_flight(samples).misfits == []
+
+
 @pytest.mark.parametrize("name", [*FLIGHT, "calm"])
 def test_a_later_strip_of_the_sensor_belongs_to_them(strips, flight, name):
     kept = replace(parse_survey(format_survey(flight.saved), "x"), fingerprint={})

@@ -10,7 +10,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import ExtraRecord
-from wavebatch.files.pulse_energy import find_pulse_energy
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
@@ -181,6 +181,7 @@ def test_the_column_of_an_import_is_used_without_being_asked_for(strip):
     # Under a calibration of pulses twice as strong it counts half, and so does its error.
     half, doubt = _filled(path, None, brighter=2.0)
     assert np.allclose(half, energy / 2) and np.allclose(doubt, error / 2)
+    assert [PulseEnergy("", mean=3.0, reference=one).level for one in (None, 2.0)] == [1.0, 1.5]
     assert _filled(path, "none") is None
     energy, _ = _filled(path, "pulse_energy")
     assert np.isnan(energy[~known]).all()

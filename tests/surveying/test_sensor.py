@@ -167,6 +167,18 @@ def test_pairs_of_returns():
     assert 0.02 < found.error < 1.0
 
 
+def test_rays_of_little_weight_say_nothing_of_where_rays_meet():
+    """Returns close together, as of branches, point anywhere."""
+    time = START_TIME + np.linspace(0.0, 3.0, 6000)
+    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * 1e5)
+    light = np.arange(6000) % 5 < 2
+    weight = np.where(light, 1e-9, 1.0)
+    aside = rays.direction + np.where(light, 0.2 * np.linalg.norm(rays.direction[0]), 0.0)[:, None] * [1.0, 0.0, 0.0]
+    found = estimate_path(RaySample(time, rays.ground, aside, weight), "pairs of returns")
+    assert np.abs(found.trajectory.at(time) - true_sensor(time)).max() < 0.1
+    assert estimate_path(RaySample(time, rays.ground, aside, weight[::-1].copy()), "pairs of returns") is None
+
+
 def about(axis, degrees):
     """Matrix of a rotation about axis 0, 1 or 2."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))

@@ -10,6 +10,7 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import Survey
 from wavebatch.surveying.systems.survey_result import SavedSurvey
+from wavebatch.tools.voxels import rays
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 NOISE = ReceiverNoise(baseline=12.0, baseline_spread=0.1, std=0.58)
@@ -134,6 +135,19 @@ def test_packets_that_overlap_count_once(canopy, whole, tmp_path):
     assert summary.pulses == N and summary.waveforms == 3 * N and max(LENGTHS) > 224
     assert summary.energy == pytest.approx(whole.energy, rel=0.002)
     assert shares(found, LAYERS) == pytest.approx(shares(joined, LAYERS), rel=0.005)
+
+
+def test_of_two_packets_that_overlap_each_counts_to_the_middle_of_what_both_recorded():
+    """Samples 0 to 9 and 6 to 19 of a ray, 1 ns apart; the middle of 5.5 to 9.5 is 7.5."""
+    packets, samples = np.zeros(2, rays.PACKET), np.zeros(24, rays.SAMPLE)
+    packets["point"], packets["seen"], packets["begin"], packets["end"] = (0, 1), True, -0.5, (9.5, 13.5)
+    packets["step"] = 0.0, 0.0, -HALF_C
+    packets["start"][1] = 6.0 * packets["step"][0]
+    samples["packet"], samples["time"] = np.repeat((0, 1), (10, 14)), [*range(10), *range(14)]
+    samples["energy"] = 100.0 * samples["packet"] + samples["time"]
+    joined = rays.join_packets(packets, samples, np.zeros(0, rays.LOST))
+    assert joined.samples["time"].tolist() == list(range(20))
+    assert joined.samples["energy"].tolist() == [*range(8), *range(102, 114)]
 
 
 def test_light_is_known_up_to_a_lost_packet(canopy, strips, tmp_path):

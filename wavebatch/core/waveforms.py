@@ -506,6 +506,11 @@ class SystemPulse:
         kind = f"{len(self.components)} Gaussians" if self.components else f"a Gaussian{skew}"
         return f"<SystemPulse: {kind}, s_ref {self.sigma_ref:.4f} ns, noise {self.noise.std:.3f} DN>"
 
+    @property
+    def pulse(self) -> tuple[Any, ...]:
+        """Its pulse alone: systems have one pulse where these are equal."""
+        return self.components, self.kappa, self.sigma_ref
+
     def of(self, block: WaveformBlock) -> SystemPulse:
         """The system of the block's digitizer: its pulse and noise, and the radiometry of the whole strip."""
         other = self.digitizers.get(block.digitizer.index)

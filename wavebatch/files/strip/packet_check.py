@@ -182,11 +182,8 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
     return VectorDecision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
 
 
-_WAVEFORMS, _SAMPLES = 1024, 1 << 20
+WAVEFORMS, SAMPLES = 1024, 1 << 20
 """Most waveforms that are compared with their returns, and about the most samples of them."""
-
-_SHORTEST = 64
-"""Waveforms that are read even if they are long."""
 
 LEAST_PACKETS = 50
 """Fewer returns prove nothing: the error of a rank correlation is 0.14."""
@@ -206,11 +203,6 @@ _SHIFTS = np.arange(1, 5) / 5
 
 _HIGHEST, _WHERE, _LOCATION, _INTENSITY, _OWN, _OTHERS, _DEPTH = range(7)
 """Columns of a table of returns."""
-
-
-def size_of_sample(longest: int) -> int:
-    """Return how many waveforms are looked at where the longest has so many samples."""
-    return int(np.clip(_SAMPLES // max(longest, 1), _SHORTEST, _WAVEFORMS))
 
 
 def is_strange(table: np.ndarray) -> bool:

@@ -175,9 +175,8 @@ class StripReader(Closing):
         file = self.facts.packets.file
         if not scan.with_waveform or self.facts.packets.internal or file is None:
             return ""
-        used = scan.by_descriptor.keys() & self.facts.digitizers
-        longest = max(self.facts.digitizers[index].n_samples for index in used)
-        table = packet_check.compare_returns(self._sample_returns(scan, packet_check.size_of_sample(longest)))
+        number = self.sample_size(scan, packet_check.WAVEFORMS, packet_check.SAMPLES)
+        table = packet_check.compare_returns(self._sample_returns(scan, number))
         if not packet_check.is_strange(table):
             return ""
         return (
@@ -283,11 +282,11 @@ class StripReader(Closing):
             for block, _ in self.read_blocks(unit, size, owned_only=True):
                 yield block
 
-    def sample_size(self, scan: StripScan) -> int:
-        """Return how many waveforms of the strip a survey reads."""
+    def sample_size(self, scan: StripScan, most: int = SAMPLE, samples: int = SAMPLE_SAMPLES) -> int:
+        """Return how many waveforms of the strip are read, by default for a survey: at most so many, and samples."""
         used = (digitizer for index, digitizer in self.facts.digitizers.items() if index in scan.by_descriptor)
         longest = max((digitizer.n_samples for digitizer in used), default=0)
-        return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, SAMPLE))
+        return int(np.clip(samples // max(longest, 1), LEAST_WAVEFORMS, most))
 
     def sample_blocks(
         self, scan: StripScan, n_waveforms: int, size: int = 4096, *, long_samples: int = LONG_SAMPLES

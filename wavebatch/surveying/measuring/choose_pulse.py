@@ -21,7 +21,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.describe import describe_left
 from wavebatch.stages.pulse_tables import clip_level, shape_limits
-from wavebatch.surveying.measuring.joint_pulse import count_telling, learn_jointly
+from wavebatch.surveying.measuring.joint_pulse import MOST_ECHOES, learn_jointly
 from wavebatch.surveying.measuring.judge import (
     SURE,
     Explained,
@@ -212,11 +212,10 @@ def choose_pulse(
         own = _find_gaussian(taught, starts["gaussian"], CHANGES[1])
         plain = abs(own.sigma_ref / starts["gaussian"].sigma_ref - 1) < MOST_SPREAD
     given = {} if plain else given or {}
-    every: dict[str, SystemPulse] = {}
-    for name, system in {**starts, **given}.items():
-        if not any(_same_pulse(system, other) for other in every.values()):
-            every[name] = system
-    looked = [_judge(few, name, system, CHANGES[1], known=name in given) for name, system in every.items()]
+    every: dict[tuple, tuple[str, SystemPulse]] = {}  # by pulse: the first that has it
+    for one in {**starts, **given}.items():
+        every.setdefault(one[1].pulse, one)
+    looked = [_judge(few, name, system, CHANGES[1], known=name in given) for name, system in every.values()]
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
@@ -254,10 +253,6 @@ def _find_gaussian(block: WaveformBlock, system: SystemPulse, change: float) -> 
     return replace(system, sigma_ref=system.sigma_ref * own)
 
 
-def _same_pulse(one: SystemPulse, other: SystemPulse) -> bool:
-    return (one.components, one.kappa, one.sigma_ref) == (other.components, other.kappa, other.sigma_ref)
-
-
 def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
     """Pulses learned from one echo per cluster and from all echoes, two rounds each; before them a Gaussian."""
     system = begin.system
@@ -267,7 +262,8 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
         for last in (False, True):
             change = begin.change if last else max(begin.change, FIRST_CHANGE)
             explained = explain(block, bear(system, change), **options)
-            if count_telling(explained) < ENOUGH_TO_LEARN:
+            number = np.diff(explained.sums.first)
+            if number[number <= MOST_ECHOES].sum() < ENOUGH_TO_LEARN:  # echoes of waveforms that say something of it
                 return
             system = learn_jointly(block, system, explained, begin.change, last=last)
         yield name, system
@@ -437,7 +433,8 @@ def settle(
     tried = []
     for significance, mirror in look_in_mirror(part, system, explained, [0.0, *map(float, harder)]):
         tried.append((replace(system, significance=significance), mirror))
-        if mirror.quiet <= _bound(FALSE_QUIET, mirror.echoes):
+        allowed = FALSE_QUIET * mirror.echoes
+        if mirror.quiet <= allowed + np.sqrt(allowed):  # no more than chance: one standard deviation
             break
     best = max(tried, key=lambda one: one[1].worth)
     first = tried[0][1]
@@ -535,8 +532,3 @@ def _explain_between(
     part = explain(block.rows(rows), system)
     length[:, rows], volume[rows] = describe_left(part.sums, sample_noise(system), changes)
     return Looked(replace_rows(near.explained, rows, part), (length, volume))
-
-
-def _bound(share: float, number: int) -> float:
-    """Events of this probability that `number` tries show without being more than chance: one standard deviation."""
-    return share * number + np.sqrt(share * number)

@@ -99,12 +99,6 @@ def learn_jointly(
     return with_fit(system, best, stack, width, spacing, misfit)
 
 
-def count_telling(explained: Explained) -> int:
-    """Count the echoes of waveforms that say something of the pulse."""
-    number = np.diff(explained.sums.first)
-    return int(number[number <= MOST_ECHOES].sum())
-
-
 def stack_jointly(system: SystemPulse, explained: Explained, change: float, spacing: float) -> Stack:
     """Return the pulse with its errors by lag [samples]."""
     s = explained.sums.left.shape[1]

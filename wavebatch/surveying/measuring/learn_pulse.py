@@ -89,12 +89,6 @@ def find_isolated(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -
     return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
 
 
-def _reach(block: WaveformBlock, system: SystemPulse) -> tuple[float, float]:
-    """How far the learned pulse reaches before and after its centre [samples]."""
-    half = max(system.sigma_ref / block.spacing / 2, 1)
-    return BEFORE * half, AFTER * half
-
-
 def part_strong(echoes: EchoTable) -> tuple[EchoTable, EchoTable]:
     """Part the clear echoes that no target has widened: the strongest fifth (FEW where there are so many), the others.
 
@@ -131,7 +125,8 @@ def learn_pulse(
     width = system.sigma_ref / block.spacing
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
     cut = block.samples[main.waveform] <= floor_level(system)
-    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, cut=cut)
+    half = max(width / 2, 1)
+    stack = stack_pulse(signal, amplitude, time, BEFORE * half, AFTER * half, QUANTISATION_STD, cut=cut)
     strongest = quantile(main.amplitude, 0.99)
     goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL

@@ -167,8 +167,7 @@ def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
 
 def find_source(system: SystemPulse) -> KnownSystem | None:
     """Return the known sensor whose pulse a system has, bit for bit; None for a pulse of its own."""
-    pulse = (system.components, system.kappa, system.sigma_ref)
-    same = (one for one in known_systems() if (one.system.components, one.system.kappa, one.system.sigma_ref) == pulse)
+    same = (one for one in known_systems() if one.system.pulse == system.pulse)
     return next(same, None) if system.components or system.kappa else None
 
 
