@@ -274,7 +274,7 @@ class Surroundings:
         square = ctypes.c_double(radius * radius)
         found = library.call("find_around", n, points, first, last, self._sorted, self._order, m, square, key)
         point, neighbour = np.divmod(np.sort(key[:found]), len(self._xyz))
-        return point, self._xyz[neighbour] - points[point]
+        return point, self._xyz.take(neighbour, axis=0) - points.take(point, axis=0)
 
 
 def measure_normals(
@@ -353,9 +353,10 @@ def _judge(
     surface &= ~((error <= max_error) & (np.hypot(error, folded) > max_error))
     untried = np.zeros(n, bool)
     # A plane through two scan lines only, which nothing could contradict.
-    apart = apart - some.centre[of]
-    away, u, v = (np.einsum("ki,ki->k", apart, some.axes[of, :, axis]) for axis in range(3))
-    near = np.abs(away) <= some.limit[of]
+    apart = apart - some.centre.take(of, axis=0)
+    axes = (some.axes[:, :, axis].take(of, axis=0) for axis in range(3))
+    away, u, v = (np.einsum("ki,ki->k", apart, one) for one in axes)
+    near = np.abs(away) <= some.limit.take(of)
     untried[rows] = in_two_lines(u[near], v[near], of[near], len(rows))
     error = np.hypot(error, folded)
     gap = np.where(error <= max_error, Gap.KNOWN, Gap.UNCERTAIN)
@@ -372,8 +373,9 @@ def _take(
     """Only the neighbourhoods of some points, numbered by their place among these."""
     place = np.full(len(planes.kept), -1)
     place[rows] = np.arange(len(rows))
-    local = place[point]
-    return offset[local >= 0], local[local >= 0], Planes(*(part[rows] for part in planes))
+    local = place.take(point)
+    near = np.flatnonzero(local >= 0)
+    return offset.take(near, axis=0), local.take(near), Planes(*(part[rows] for part in planes))
 
 
 def find_edges(

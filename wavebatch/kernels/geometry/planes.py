@@ -119,9 +119,10 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
         local = np.repeat(np.arange(len(active)), many)
         rows = np.arange(len(local)) + ((np.cumsum(count) - count)[active] - (np.cumsum(many) - many))[local]
         at = group[rows]
-        off = (x[0][rows] - centre[at, 0]) * axes[at, 0, 0]
-        off += (x[1][rows] - centre[at, 1]) * axes[at, 1, 0]
-        off += (x[2][rows] - centre[at, 2]) * axes[at, 2, 0]
+        middle, normal = (np.ascontiguousarray(part[active].T) for part in (centre, axes[:, :, 0]))
+        off = (x[0].take(rows) - middle[0].take(local)) * normal[0].take(local)
+        off += (x[1].take(rows) - middle[1].take(local)) * normal[1].take(local)
+        off += (x[2].take(rows) - middle[2].take(local)) * normal[2].take(local)
         off = np.abs(off)
         tight = (number < _TIGHT_ROUNDS) & (spreads[active, 0] > SMOOTH * spreads[active, 1])
         # The median distance from a plane fitted to few points is too small (Rousseeuw and Leroy 1987).
