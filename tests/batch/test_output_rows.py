@@ -10,7 +10,7 @@ from batch_tools import make_job, read_cloud, run_one
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.output_rows import assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.unit import prepare_strip
+from wavebatch.batch.unit import CHUNK_POINTS, Packing, prepare_strip
 from wavebatch.core.echoes import COLUMNS, PASSED_THROUGH, Column, EchoFlag
 from wavebatch.core.errors import StageError
 from wavebatch.files.las.header import split_numbers
@@ -398,3 +398,13 @@ def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):
     with pytest.raises(StageError, match="one to one"):
         assemble_returns(unit, wrong, prepared.layout)
     prepared.scan.close()
+
+
+def test_the_last_chunk_holds_the_rows_that_are_left_be_it_one():
+    packing = Packing()
+    assert packing.is_empty and not packing.has_chunk(last=True)
+    packing.add(np.zeros(CHUNK_POINTS + 1))
+    assert packing.has_chunk(last=False)
+    packing.next_chunk()
+    assert not packing.has_chunk(last=False) and packing.has_chunk(last=True)
+    assert [part[1:] for part in packing.next_chunk()] == [(CHUNK_POINTS, CHUNK_POINTS + 1)]

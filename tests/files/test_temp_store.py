@@ -99,3 +99,11 @@ def test_a_disk_that_is_full_for_a_moment_doubles_nothing():
         for bucket in range(3):
             np.testing.assert_array_equal(whole.read(bucket), numbers[bucket::3])
             np.testing.assert_array_equal(copy.read(bucket), numbers[bucket::3])
+
+
+def test_a_store_gives_its_rows_back_in_pieces_that_do_not_overlap(tmp_path):
+    rows = np.zeros(10, ROW)
+    rows["number"] = np.arange(10)
+    with closing(temp_store.RowStore(tmp_path / "a.laz", ROW)) as store:
+        store.add(rows)
+        assert [part["number"].tolist() for part in store.pieces(4)] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
