@@ -178,6 +178,13 @@ def test_one_broad_echo_is_taken_where_it_explains_as_much_as_several():
     assert (pair.number >= 2).all() and (pair.number == 2).mean() > 0.97
 
 
+def test_two_echoes_that_make_none_broader_than_others_may_be_stay_two():
+    """As the fit found them: only what is broader is looked for as one."""
+    noise = np.random.default_rng(4).standard_normal((100, LENGTH))
+    start = np.tile(np.array([[90.0, 90.0], [19.0, 29.0], [5.0, 5.0]]), (100, 1, 1))
+    assert decompose(np.rint(bell(24, 100, 6.0) + noise), start, std=1.04, **GROWING).number.mean() > 1.8
+
+
 def test_a_misfit_of_the_pulse_joins_no_ground_to_a_canopy():
     """It may explain one fall of chi2, not one for each echo of the canopy."""
     noise = np.random.default_rng(5).standard_normal((100, LENGTH))
