@@ -177,7 +177,7 @@ class Solution(NamedTuple):
         first = np.cumsum(self.number) - self.number
         number = self.number[rows]
         echo = np.arange(number.sum()) + np.repeat(first[rows] - (np.cumsum(number) - number), number)
-        return Solution(*(column[rows] for column in self[:3]), *(column[echo] for column in self[3:]))
+        return Solution(*(one.take(rows) for one in self[:3]), *(one.take(echo, axis=0) for one in self[3:]))
 
 
 def choose(solutions: list[Solution], chosen: np.ndarray) -> Solution:
@@ -230,7 +230,8 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
         reached = call("decompose_clusters", *problem, ctypes.c_int64(done), out, ctypes.byref(found))
         parts.append([column[: found.value] for column in echoes])
         room, done = 2 * room, reached
-    return Solution(number, converged, cost, *(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    joined = parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
+    return Solution(number, converged, cost, *joined)
 
 
 def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, settings: Settings) -> np.ndarray:
