@@ -81,8 +81,9 @@ LARGEST_MISS, MOST_MISS = 0.01, 0.1
 """Distance by which a ray misses the path, over its length, and share of such rays, from which they do not meet: the
 path of two sensors with the same times is half way between them. Those of real sensors miss it by a thousandth."""
 
-SURE_HEIGHTS = 4.0
-"""Errors from which rays come from several heights: a twelfth of 1,000 rays shows that so, wherever they come from."""
+SURE_HEIGHTS, LEAST_HEIGHTS = 4.0, 1e-3
+"""Errors from which rays come from several heights: a twelfth of 1,000 rays shows that so, wherever they come from; and
+least standard deviation of these heights that counts, over the distance: drifts of attitude look like a tenth of it."""
 
 TURNED = ("turned_deg", "turned_error_deg", "is_turned")
 """Facts of a turn of the packet vectors."""
@@ -621,6 +622,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     unit = rays.direction[sure] / np.sqrt((rays.direction[sure] ** 2).sum(axis=1))[:, None]
     miss = np.sqrt(np.square(np.cross(rays.point[sure] - path.at(rays.time[sure]), unit)).sum(axis=1))
     above = _measure_heights(rays.point[sure] - path.at(rays.time[sure]), unit)
+    above *= above > LEAST_HEIGHTS * distance
     if np.mean(miss > LARGEST_MISS * distance) > MOST_MISS or above > LARGEST_MISS * distance:
         return None
     error, facts = float(np.sqrt(np.mean(squares) + motion + above**2)), _describe(found, path, rays)
