@@ -95,7 +95,7 @@ EXPORT int64_t weigh_fits(const Table *t, const Unexplained *u, double *unexplai
                 const float strong = t->amplitude[k], core = fabs(lag) < u->core ? (float)u->misfit * strong : 0;
                 double left = 0;
                 if (k == j) continue;
-                if (strong > (float)u->clear && fabs(lag) < u->beside) interpolate_row(lag, u->left.n, 1, u->left.lag, u->left.value, &left);
+                if (u->left.n && strong > (float)u->clear && fabs(lag) < u->beside) interpolate_row(lag, u->left.n, 1, u->left.lag, u->left.value, &left);
                 beside[j] = fmax(beside[j], (float)u->energy * (core * core) + left);
             }
         }

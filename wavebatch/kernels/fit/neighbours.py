@@ -7,7 +7,7 @@ pairs. Laws say which echoes are faint, or what fits leave unexplained; stages m
 from __future__ import annotations
 
 import ctypes
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -107,7 +107,7 @@ def weigh_fits(echoes: dict[str, np.ndarray], law: Unexplained, *, others: bool)
         Largest of what the others leave, in the variance of the echo; 0 without `others`.
     """
     table, (unexplained, beside) = _as_table(echoes), np.zeros((2, len(echoes["time"])))
-    call("weigh_fits", table, _as_unexplained(law), unexplained, beside if others else None)
+    call("weigh_fits", table, _as_structure(library.CUnexplained, law, "left"), unexplained, beside if others else None)
     return unexplained, beside
 
 
@@ -172,15 +172,14 @@ def finish_echoes(
     if m and not 0 <= columns["waveform"].min() <= columns["waveform"].max() < len(samples.counts):
         raise ValueError("an echo lies in no waveform")
     table = _as_table(columns, row)
-    if factors is not None and (factors.shape[1:] != (4,) or (m and not 0 <= row.min() <= row.max() < len(factors))):
-        raise ValueError("an echo has no factors")
-    if factors is not None and steps.unexplained is None:
-        raise ValueError("nothing says how errors grow")
+    rows = 0 if factors is None or factors.shape[1:] != (4,) or steps.unexplained is None else len(factors)
+    if factors is not None and m and not 0 <= row.min() <= row.max() < rows:
+        raise ValueError("an echo has no factors, or nothing says how errors grow")
     laws = {
-        "unproven": steps.unproven and _as_faintness(steps.unproven),
-        "unexplained": steps.unexplained and _as_unexplained(steps.unexplained),
+        "unproven": steps.unproven and _as_structure(library.CFaintness, steps.unproven, "tail"),
+        "unexplained": steps.unexplained and _as_structure(library.CUnexplained, steps.unexplained, "left"),
         "flagging": steps.flagging and library.CFlagging(*steps.flagging),
-        "ringing": steps.ringing and _as_faintness(steps.ringing),
+        "ringing": steps.ringing and _as_structure(library.CFaintness, steps.ringing, "tail"),
     }
     given = steps._asdict() | {name: law and ctypes.addressof(law) for name, law in laws.items()}
     structure = library.CFinishing(**given, factors=None if factors is None else place(factors, np.float64))
@@ -201,18 +200,10 @@ def _as_table(echoes: dict[str, np.ndarray], row: np.ndarray | None = None) -> l
     return table
 
 
-def _as_faintness(law: Faintness) -> library.CFaintness:
-    """The structure, which holds the arrays to which it points."""
-    curve = _as_curve(law.tail)
-    structure = library.CFaintness(*law[:6], curve, *law[7:])
-    structure.arrays = curve.arrays
-    return structure
-
-
-def _as_unexplained(law: Unexplained) -> library.CUnexplained:
-    """As `_as_faintness`."""
-    curve = _as_curve(law.left or ((0.0, 0.0),))
-    structure = library.CUnexplained(*law[:5], curve, *law[6:])
+def _as_structure(kind: Any, law: Any, points: str) -> Any:
+    """The structure of a law whose curve has this name; it holds the arrays to which it points."""
+    curve = _as_curve(getattr(law, points))
+    structure = kind(**law._asdict() | {points: curve})
     structure.arrays = curve.arrays
     return structure
 
