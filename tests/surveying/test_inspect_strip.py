@@ -73,6 +73,11 @@ def test_check_gives_every_problem_a_line_with_its_place(tmp_path):
     assert all(line.startswith(f"{path}: ") for line in lines)
 
 
+def test_info_says_a_problem_once():
+    result = run("info", data_file("no-packets/pdrf9-1.5.laz"))
+    assert result.exit_code == 1 and result.stdout.count("compression of LAS 1.5") == 1
+
+
 def test_check_counts_points_without_a_possible_time(tmp_path):
     raw = make_raw(60, most_returns=1)
     raw.points["gps_time"][:4] = np.nan, np.inf, 1e300, -1e11

@@ -84,7 +84,8 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
     try:
         facts |= _describe_points(path, header, bool(runs))
     except InputError as error:
-        facts["problems"] = [*facts["problems"], " ".join(str(error).split()).removeprefix(f"{path}: ")]
+        found = " ".join(str(error).split()).removeprefix(f"{path}: ")
+        facts["problems"] = list(dict.fromkeys([*facts["problems"], found]))
     return without_nan(facts)
 
 
