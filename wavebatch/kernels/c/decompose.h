@@ -124,7 +124,7 @@ static int grow_window(const Settings *s, const Limits *limits, const Prior *wid
         missed = misses_echoes(s, work, work->fit.cost, fall);
         if (!(work->fit.converged || missed) || !may_grow(s, &work->window) || k >= s->max_echoes) return 0;
         if (s->whitened) whitened_moments(s, work, &work->fit);
-        else hermite_moments(work, &work->fit);
+        else hermite_moments(s, work, &work->fit);
         if (!(s->whitened ? is_whitened_misfit : is_misfit)(s, work, &work->fit)) return 0;
         if (!reserve(work, k + 1, work->window.vectors)) return -1;
         double promise = propose_echo(s, work, &work->fit, limits, &work->next);
@@ -337,7 +337,7 @@ EXPORT int64_t promise_echoes(const Block *block, const Clusters *clusters, cons
         evaluate_rows(k, 3, s, &work, work.fit.parameters);
         multiply_rows(3 * k + 1, work.window.vectors, work.rows, work.fit.gram);
         if (s->whitened) { find_new_energy(&work); whitened_moments(s, &work, &work.fit); }
-        else hermite_moments(&work, &work.fit);
+        else hermite_moments(s, &work, &work.fit);
         promise[i] = propose_echo(s, &work, &work.fit, &limits, &work.next);
     }
     free_work(&work);

@@ -17,20 +17,27 @@ static void set_equations(const Fit *fit, Work *work) {
 }
 
 /* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. The directions are the next
-   two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. */
-static void hermite_moments(Work *work, const Fit *fit) {
+   two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. Where levels are free, rows of
+   the fit have no pulses any more: far from an echo a bit of l times z^2 would be more than it. */
+static void hermite_moments(const Settings *s, Work *work, const Fit *fit) {
     const Window *w = &work->window;
     const int64_t k = fit->k, n = w->vectors;
-    const lanes *row = work->rows, *residual = work->rows + 3 * k * n;
+    const lanes *residual = work->rows + 3 * k * n;
+    const int anew = w->level_share > 0;
     for (int64_t j = 0; j < k; j++) {
+        lanes *first = anew ? work->about : work->rows + j * n;
+        const int64_t next = anew ? n : k * n; /* from the pulse to its slopes */
+        const Basis row = {first, first + next, first + 2 * next, first + 3 * next};
+        const Echo echo = {fit->parameters[j], fit->parameters[k + j], fit->parameters[2 * k + j], 0};
+        if (anew) evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
         lanes norm3 = ALL(0), norm4 = ALL(0), sum3 = ALL(0), sum4 = ALL(0);
         float time = fit->parameters[k + j], inverse = 1 / fit->parameters[2 * k + j];
         for (int64_t v = 0; v < n; v++) {
             lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
-            lanes pulse = row[j * n + v], by_time = row[(k + j) * n + v], by_width = row[(2 * k + j) * n + v];
-            lanes third = by_width * z, fourth = third * z;
-            third = third * 8.f - by_time * 12.f;
-            fourth = fourth * 16.f - by_width * 48.f + pulse * 12.f;
+            lanes weight = anew && w->is_weighted ? w->weight[v] : ALL(1);
+            lanes third = row.by_width[v] * z, fourth = third * z;
+            third = (third * 8.f - row.by_time[v] * 12.f) * weight;
+            fourth = (fourth * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
             norm3 += third * third; sum3 += third * residual[v];
             norm4 += fourth * fourth; sum4 += fourth * residual[v];
         }
