@@ -26,10 +26,10 @@ def settings(**options):
 
 
 def decompose(y, start, std=1.0, missing=None, level_err=None, **options):
-    """The Solution of rows y (m, L), counts above a level of 0, from starts (m, 3, k); level_err: a number."""
+    """The Solution of rows y (m, L), counts above a level of 0, from starts (m, 3, k); level_err: a number, or (m,)."""
     m, _, k = start.shape
     y = np.ascontiguousarray(y) if y.dtype in (np.uint8, np.uint16, np.uint32) else y.astype(np.float32)
-    levels = None if level_err is None else np.full(m, level_err, np.float32)
+    levels = None if level_err is None else np.full(m, level_err).astype(np.float32)
     samples = Samples(y, np.zeros(m, np.float32), np.full(m, std, np.float32), missing, levels)
     rows = np.arange(m)
     amplitude, time, width = (start[:, i].ravel().astype(float) for i in range(3))

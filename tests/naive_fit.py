@@ -62,16 +62,16 @@ def slopes(p, x, **shape):
 
 
 def moments(p, x, residual, std, white=None, shape=None):
-    """h3 and h4 of the residual around each Gaussian, (k,) both; white: of whitened directions less what fits take."""
+    """h3 and h4 of the residual around each Gaussian, (k,) both; white: of whitened directions; shape: less what fits take."""
     found = []
-    fitted = None if white is None else white @ slopes(p, x, **shape)
+    fitted = None if shape is None else white @ slopes(p, x, **shape)
     for _, t, s in p.T:
         z = np.clip((x - t) / s, -5, 5)
         bell = np.exp(-0.5 * ((x - t) / s) ** 2)
         before = fitted
         for direction in ((8 * z**3 - 12 * z) * bell, (16 * z**4 - 48 * z**2 + 12) * bell):
-            if white is not None:
-                direction = white @ direction
+            direction = direction if white is None else white @ direction
+            if shape is not None:
                 direction = direction - before @ np.linalg.lstsq(before, direction, rcond=None)[0]
                 before = np.c_[before, direction]
             found.append(direction @ residual / np.sqrt(max(direction @ direction, 1e-12)) / std)
@@ -91,7 +91,7 @@ def is_misfit(p, x, residual, std, s, white=None, shape=None):
         h3, h4 = moments(p, x, residual, std, white, shape)
         return highest > s.gate_residual * std or (h3**2 + h4**2).max() > s.gate_hermite
     smooth = (residual[:-2] + 2 * residual[1:-1] + residual[2:]) / 4
-    h3, h4 = moments(p, x, residual, std)
+    h3, h4 = moments(p, x, residual, std, white)
     return smooth.max(initial=0) > s.gate_residual * GAIN_121 * std or (h3**2 + h4**2).max() > s.gate_hermite
 
 
@@ -113,7 +113,7 @@ def propose(p, x, residual, std, s, shape, white=None):
     ref = s.width_ref
     old = np.array([np.maximum(a + da, 0.2 * a), t + np.clip(dt, -ref, ref), w + np.clip(ds, -0.4 * w, 0.3 * w)])
     start, promise = np.c_[old, [height, x[place], ref]], best / std**2
-    h3, h4 = moments(p, x, residual, std, None if s.whitening is None else white, shape)
+    h3, h4 = moments(p, x, residual, std, white, None if s.whitening is None else shape)
     gain = np.where(h4 < 0, h3**2 + h4**2, 0.0)
     j = int(np.argmax(gain))
     if gain[j] > promise:

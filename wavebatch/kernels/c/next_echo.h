@@ -16,33 +16,37 @@ static void set_equations(const Fit *fit, Work *work) {
     }
 }
 
+INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
+    lanes sum = ALL(0);
+    for (int64_t v = 0; v < n; v++) sum += a[v] * b[v];
+    return sum_lanes(sum);
+}
+
 /* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. The directions are the next
-   two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. Where levels are free, rows of
-   the fit have no pulses any more: far from an echo a bit of l times z^2 would be more than it. */
+   two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. Where levels are free, rows of the
+   fit lack their share of l, and z^2 times that would be more than the pulse: pulses are evaluated anew. */
 static void hermite_moments(const Settings *s, Work *work, const Fit *fit) {
     const Window *w = &work->window;
     const int64_t k = fit->k, n = w->vectors;
     const lanes *residual = work->rows + 3 * k * n;
     const int anew = w->level_share > 0;
+    lanes *third = work->about + 3 * n, *fourth = work->about + 4 * n;
     for (int64_t j = 0; j < k; j++) {
+        const Echo echo = {fit->parameters[j], fit->parameters[k + j], fit->parameters[2 * k + j], 0};
+        const float time = echo.time, inverse = 1 / echo.width;
         lanes *first = anew ? work->about : work->rows + j * n;
         const int64_t next = anew ? n : k * n; /* from the pulse to its slopes */
-        const Basis row = {first, first + next, first + 2 * next, first + 3 * next};
-        const Echo echo = {fit->parameters[j], fit->parameters[k + j], fit->parameters[2 * k + j], 0};
+        const Basis row = {first, first + next, first + 2 * next, third};
         if (anew) evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
-        lanes norm3 = ALL(0), norm4 = ALL(0), sum3 = ALL(0), sum4 = ALL(0);
-        float time = fit->parameters[k + j], inverse = 1 / fit->parameters[2 * k + j];
         for (int64_t v = 0; v < n; v++) {
-            lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
-            lanes weight = anew && w->is_weighted ? w->weight[v] : ALL(1);
-            lanes third = row.by_width[v] * z, fourth = third * z;
-            third = (third * 8.f - row.by_time[v] * 12.f) * weight;
-            fourth = (fourth * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
-            norm3 += third * third; sum3 += third * residual[v];
-            norm4 += fourth * fourth; sum4 += fourth * residual[v];
+            const lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
+            const lanes once = row.by_width[v] * z, twice = once * z, weight = anew && w->is_weighted ? w->weight[v] : ALL(1);
+            third[v] = (once * 8.f - row.by_time[v] * 12.f) * weight;
+            fourth[v] = (twice * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
         }
-        work->h3[j] = sum_lanes(sum3) / sqrt(fmax(sum_lanes(norm3), 1e-12)) / w->std;
-        work->h4[j] = sum_lanes(sum4) / sqrt(fmax(sum_lanes(norm4), 1e-12)) / w->std;
+        if (anew) { take_level_off(w, third); take_level_off(w, fourth); }
+        work->h3[j] = multiply(n, third, residual) / sqrt(fmax(multiply(n, third, third), 1e-12)) / w->std;
+        work->h4[j] = multiply(n, fourth, residual) / sqrt(fmax(multiply(n, fourth, fourth), 1e-12)) / w->std;
     }
 }
 
@@ -60,12 +64,6 @@ static void take_rows_off(Work *work, int64_t p, lanes *direction) {
         const float part = share[i];
         for (int64_t v = 0; v < n; v++) direction[v] -= work->rows[i * n + v] * part;
     }
-}
-
-INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
-    lanes sum = ALL(0);
-    for (int64_t v = 0; v < n; v++) sum += a[v] * b[v];
-    return sum_lanes(sum);
 }
 
 /* The same where noise is whitened: the two directions are, too, and then what the fit removes is taken off them. */
@@ -91,6 +89,7 @@ static void whitened_moments(const Settings *s, Work *work, const Fit *fit) {
         for (int q = 0; q < 2; q++) {
             lanes *direction = q ? fourth : third;
             whiten(w, direction);
+            if (w->level_share > 0) take_level_off(w, direction);
             const double all = multiply(n, direction, direction);
             take_rows_off(work, p, direction);
             if (q) {
