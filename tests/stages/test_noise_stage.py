@@ -86,3 +86,23 @@ def test_a_wrong_level_is_neither_an_echo_nor_an_amplitude(correlation):
     (false, scatter, _, _), (left, rest, within, number) = found
     assert left < 0.4 * false and rest < (0.9 if correlation else 0.5) * scatter
     assert 0.6 < within < 0.8 and number >= 0.99 * 2 * m
+
+
+def test_the_level_of_a_recording_has_an_error_of_its_own():
+    """Two recordings 20 counts apart, each with an echo that leaves few quiet samples: a third was in one error."""
+    rng, m, sigma, x = np.random.default_rng(2), 400, 6.0, np.arange(96)
+    time, height = np.array([18.0, 74.0]), rng.uniform(20, 60, (m, 2))
+    y = 20 + 20.0 * (x >= 44) + rng.standard_normal((m, len(x)))
+    y += (height[:, :, None] * np.exp(-0.5 * ((x - time[:, None]) / sigma) ** 2)).sum(axis=1)
+    missing = np.zeros(y.shape, bool)
+    missing[:, 38:44] = True
+    block = replace(WaveformBlock.from_samples(np.rint(y).astype(np.uint16)), missing=missing)
+    system = SystemPulse(sigma, noise=ReceiverNoise(baseline=20.0, std=1.04, by_kind={"quiet": 1.04}))
+    noise = pooled(block, system)
+    assert noise.of_sample is not None
+    echoes = adaptive(block, noise, system, maximum(block, noise, system))
+    away = np.abs(echoes.time[:, None] - time)
+    near = away.min(axis=1) < 3
+    off = echoes.amplitude[near] - height[echoes.waveform[near], away.argmin(axis=1)[near]]
+    assert np.count_nonzero(near) >= 0.99 * 2 * m and np.count_nonzero(~near) < 0.02 * m
+    assert 0.6 < np.mean(np.abs(off) < echoes.amplitude_err[near]) < 0.8

@@ -116,7 +116,10 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     of_sample = np.repeat(noise.baseline[:, None], s, axis=1)
     run, place = list_samples(*((row * s + edge)[apart] for edge in (start, end)))
     of_sample.reshape(-1)[place] = level[apart][run]
-    return replace(noise, of_sample=of_sample)
+    known = np.where(number >= LEAST_QUIET, spread / np.sqrt(np.maximum(number, 1)), FOOT * std)
+    error = np.zeros(len(block), np.float32) if noise.baseline_err is None else noise.baseline_err.copy()
+    np.maximum.at(error, row[apart], known[apart].astype(np.float32))
+    return replace(noise, of_sample=of_sample, baseline_err=error)
 
 
 def _lowest_levels(signal: np.ndarray, std: float) -> np.ndarray:
