@@ -90,8 +90,8 @@ def test_a_wrong_level_is_neither_an_echo_nor_an_amplitude(correlation):
 
 def test_the_level_of_a_recording_has_an_error_of_its_own():
     """Two recordings 20 counts apart, each with an echo that leaves few quiet samples: a third was in one error."""
-    rng, m, sigma, x = np.random.default_rng(2), 400, 6.0, np.arange(96)
-    time, height = np.array([18.0, 74.0]), rng.uniform(20, 60, (m, 2))
+    rng, m, sigma, x = np.random.default_rng(2), 400, 6.0, np.arange(80)
+    time, height = np.array([16.0, 64.0]), np.exp(rng.uniform(np.log(10), np.log(150), (m, 2)))
     y = 20 + 20.0 * (x >= 44) + rng.standard_normal((m, len(x)))
     y += (height[:, :, None] * np.exp(-0.5 * ((x - time[:, None]) / sigma) ** 2)).sum(axis=1)
     missing = np.zeros(y.shape, bool)
