@@ -62,7 +62,7 @@ def slopes(p, x, **shape):
 
 
 def moments(p, x, residual, std, white=None, shape=None):
-    """h3 and h4 of the residual around each Gaussian, (k,) both; white: whitens directions; shape: they lose what fits take."""
+    """h3 and h4 of the residual around each Gaussian, (k,) both; white: of directions; shape: less what fits take."""
     found = []
     fitted = None if shape is None else white @ slopes(p, x, **shape)
     for _, t, s in p.T:
