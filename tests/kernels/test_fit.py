@@ -135,13 +135,16 @@ def test_samples_at_the_floor_count_where_the_model_is_above_them(rng):
     assert (found.cost > 2 * LENGTH).all()
 
 
-def test_noise_that_grows_with_the_signal_weighs_samples(rng):
+@pytest.mark.parametrize("level_err", [None, 0.7])
+def test_noise_that_grows_with_the_signal_weighs_samples(rng, level_err):
     truth = draw(rng, 8, 1)
     y, start = record(rng, truth), near(rng, truth)
     smooth = np.pad(y, ((0, 0), (2, 2)), mode="edge") @ np.stack([np.roll([1, 4, 6, 4, 1] + [0] * (LENGTH - 1), i)
                                                                   for i in range(LENGTH)], axis=1) / 16  # fmt: skip
     weight = 1 / np.sqrt(1 + 0.2 * np.maximum(smooth, 0))
-    assert_reaches_scipy(y, fit(y, start, noise_gain=0.2, **TIGHT), start, weight=weight)
+    found = fit(y, start, noise_gain=0.2, level_err=level_err, **TIGHT)
+    white = np.array([naive_fit.free_level(np.diag(row), np.zeros(LENGTH, bool), level_err or 0.0) for row in weight])
+    assert_reaches_scipy(y, found, start, white=white)
 
 
 def test_missing_samples_take_no_part(rng):
