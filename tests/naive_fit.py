@@ -313,7 +313,7 @@ def describe_whole(whole, fitted, error, shared):
     return value, value_error
 
 
-def keep(clusters, solution, whole, factors, std, spacing, length, significance, acceptance=0.0, level_err=None):
+def keep(clusters, solution, whole, factors, std, spacing, length, significance, level_err=None):
     """Rows of the echoes that are kept, as tuples in the order of the columns of a table of echoes."""
     rows, energies = [], relative_energy_errors(solution.parameters[:, :3], solution.errors[:, :3], solution.shared)
     for i, c in enumerate(np.repeat(np.arange(len(solution.number)), solution.number)):
@@ -326,7 +326,7 @@ def keep(clusters, solution, whole, factors, std, spacing, length, significance,
             ratio = float(level_err[clusters.waveform[c]]) / float(std[clusters.waveform[c]])
             ratio = ratio * ratio / (1 + ratio * ratio * max(clusters.high[c] - clusters.low[c], 5 * width))
             rest = amplitude * amplitude * width * (np.sqrt(np.pi) - 2 * np.pi * width * ratio)
-            strong &= rest >= acceptance * float(std[clusters.waveform[c]]) ** 2
+            strong &= rest >= 15 * float(std[clusters.waveform[c]]) ** 2
         if not (strong and -0.5 * width <= time <= length - 1 + 0.5 * width and np.isfinite(errors).all()):
             continue
         flags = EchoFlag(0)

@@ -42,7 +42,7 @@ def test_the_library_keeps_and_describes_echoes_as_the_loop(name, most, level, r
     whole = whole_pulse(SHAPES[name], LIMITS, fitted[:, 2])
     assert bool(len(whole.wide)) == (name == "learned" and most > 8)
     factors, std = rng.uniform(0.5, 1.5, (m, 4)), rng.uniform(0.5, 2, 200).astype(np.float32)
-    problem = clusters, solution, whole, factors, std, 0.5, 80, 4.5, 15.0, None if level is None else level * std
+    problem = clusters, solution, whole, factors, std, 0.5, 80, 4.5, None if level is None else level * std
     with np.errstate(all="ignore"):
         columns, row = keep_echoes(*problem)
         expected = naive_fit.keep(*problem)

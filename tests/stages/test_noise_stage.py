@@ -106,3 +106,11 @@ def test_the_level_of_a_recording_has_an_error_of_its_own():
     off = echoes.amplitude[near] - height[echoes.waveform[near], away.argmin(axis=1)[near]]
     assert np.count_nonzero(near) >= 0.99 * 2 * m and np.count_nonzero(~near) < 0.02 * m
     assert 0.6 < np.mean(np.abs(off) < echoes.amplitude_err[near]) < 0.8
+
+
+def test_what_one_more_echo_needs_is_not_asked_of_lone_ones(rng):
+    block = record(rng)
+    noise = pooled(block, SYSTEM)
+    assert (noise.baseline_err > 0).all()
+    found = [adaptive(block, noise, SYSTEM, maximum(block, noise, SYSTEM), acceptance=least) for least in (1e5, 15.0)]
+    assert (found[0].count(60) >= 1).all() and len(found[1]) >= len(found[0])

@@ -183,7 +183,7 @@ class CKeeping(ctypes.Structure):
 
     _fields_ = [
         *_fields(_POINTER, "std level_err factors"),
-        *_fields(ctypes.c_double, "spacing last significance acceptance"),
+        *_fields(ctypes.c_double, "spacing last significance"),
     ]
 
 

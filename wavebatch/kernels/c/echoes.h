@@ -4,6 +4,7 @@
    stages/pulse_tables.py has the tables and their reasons. */
 
 enum { AS_FITTED, STRETCHED, SUMMED };         /* how the pulse widens: parameters are those of the echo, or need tables */
+static const double PROVEN_ALONE = 15;         /* fall of chi2 without an echo from which it is no error of the level: as for one more */
 static const double LEAST_LEVEL = 5;           /* widths of an echo that show a level at least: its flanks still tell it from one */
 enum { FLAG_NOT_CONVERGED = 1, FLAG_AT_BOUND = 2, FLAG_OVERLAPPED = 16 };
 
@@ -17,8 +18,7 @@ typedef struct { /* what fits become echoes */
     const float *std;                          /* noise of each waveform */
     const float *level_err;                    /* of the level of each waveform, where fits left it free; or NULL */
     const double *factors;                     /* on the errors of amplitude, time, sigma and energy of each echo */
-    double spacing, last, significance, acceptance; /* last sample of a waveform; least energy of an echo, in noise; and of
-                                                  what no error of the level explains, in its square */
+    double spacing, last, significance;        /* last sample of a waveform; least energy of an echo, in noise */
 } Keeping;
 
 typedef struct { /* core columns of a table of m echoes, and the row of each among the fitted ones */
@@ -84,7 +84,7 @@ EXPORT int64_t keep_echoes(const Clusters *clusters, const Echoes *fits, const W
             if (level > 0) { /* an error of the level explains its share of the squared sum of the samples */
                 const double length = fmax(clusters->high[c] - clusters->low[c], LEAST_LEVEL * value[2]);
                 const double share = level * level / (1 + level * level * length), sum = 6.283185307179586 * square * value[2]; /* 2 pi */
-                if (energy - share * sum < keeping->acceptance * std * std) continue;
+                if (energy - share * sum < PROVEN_ALONE * std * std) continue;
             }
             if (!(energy >= noise * noise && value[1] >= -0.5 * value[2] && value[1] <= keeping->last + 0.5 * value[2])) continue;
             if (!isfinite(errors[0]) || !isfinite(errors[1]) || !isfinite(errors[2])) continue;

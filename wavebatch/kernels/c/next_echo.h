@@ -22,6 +22,12 @@ INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
     return sum_lanes(sum);
 }
 
+/* Weight of a sample in directions of the residual: clipped samples may not count. */
+INLINE lanes counted(const Window *w, int64_t v) {
+    const lanes weight = w->is_weighted ? w->weight[v] : ALL(1);
+    return w->any_clipped ? pick(w->clipped[v] != 0.f, ALL(0), weight) : weight;
+}
+
 /* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. The directions are the next
    two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. Where levels are free, rows of the
    fit lack their share of l, and z^2 times that would be more than the pulse: pulses are evaluated anew. */
@@ -40,7 +46,7 @@ static void hermite_moments(const Settings *s, Work *work, const Fit *fit) {
         if (anew) evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
         for (int64_t v = 0; v < n; v++) {
             const lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
-            const lanes once = row.by_width[v] * z, twice = once * z, weight = anew && w->is_weighted ? w->weight[v] : ALL(1);
+            const lanes once = row.by_width[v] * z, twice = once * z, weight = anew ? counted(w, v) : ALL(1);
             third[v] = (once * 8.f - row.by_time[v] * 12.f) * weight;
             fourth[v] = (twice * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
         }

@@ -383,7 +383,6 @@ def keep_echoes(
     spacing: float,
     length: int,
     significance: float,
-    acceptance: float = 0.0,
     level_err: np.ndarray | None = None,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Echoes of fits that noise does not explain and that lie in their waveform, as columns of a table.
@@ -404,8 +403,6 @@ def keep_echoes(
         Samples of a waveform.
     significance : float
         Least energy of an echo [standard deviations].
-    acceptance : float
-        Least energy of what an error of the level does not explain of it [squared standard deviations].
     level_err : float32 (n,), optional
         Standard deviations of the levels that fits left free [count]; None where they took them as known.
 
@@ -434,7 +431,7 @@ def keep_echoes(
         library.Echoes(m, *map(library.address, fits)), whole.as_structure(fits[4][:, 2]),
         library.CKeeping(
             library.address(std), None if level_err is None else library.address(level_err), library.address(factors),
-            spacing, length - 1, significance, acceptance,
+            spacing, length - 1, significance,
         ),
         library.CTable(m, *map(library.address, columns.values())),
     )  # fmt: skip

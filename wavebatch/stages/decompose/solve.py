@@ -437,7 +437,7 @@ def describe_solution(
     factors = error_factors(fitted, spacing, widths, beside)
     whole = whole_pulse(settings.shape, limits, widths)
     columns, row = decompose.keep_echoes(
-        clusters, solution, whole, factors, noise.std, spacing, length, significance, settings.acceptance, free
+        clusters, solution, whole, factors, noise.std, spacing, length, significance, free
     )
     proves = bool(settings.shape.components) or not system.components
     steps = flagging(block, system)._replace(
