@@ -45,7 +45,9 @@ def test_what_is_no_las_file_is_one_line(tmp_path, data, message):
         ("Zürich".encode(), "Zürich"),
         ("Zürich".encode("latin-1"), "Zürich"),
         (b"Caf\xe9", "Café"),  # the first byte of a letter of UTF-8 that is not cut, for the field has room
-        (b"s" * 31 + "ü".encode()[:1], "s" * 31),
+        (("ü" + "s" * 29 + "ü").encode()[:32], "ü" + "s" * 29),
+        (("s" * 29 + "üü").encode()[:32], "s" * 29 + "ü"),
+        (b"s" * 28 + b"Caf\xe9", "s" * 28 + "Café"),
     ],
 )
 def test_texts_of_headers_are_utf_8_or_latin_1(stored, text):

@@ -15,6 +15,7 @@ unknown content.
 from __future__ import annotations
 
 import codecs
+import contextlib
 import os
 import struct
 from collections.abc import Container, Iterable, Sequence
@@ -343,10 +344,11 @@ def read_evlr(path: Path, evlr: Evlr) -> bytes:
 def decode_text(data: bytes) -> str:
     """Return a text field up to its first NUL: UTF-8, the last letter of which a full field may cut, else Latin-1."""
     text, end, _ = data.partition(b"\0")
-    try:
-        return codecs.utf_8_decode(text, "strict", bool(end))[0]
-    except UnicodeDecodeError:
-        return text.decode("latin-1")
+    with contextlib.suppress(UnicodeDecodeError):
+        found, used = codecs.utf_8_decode(text, "strict", bool(end))
+        if used == len(text) or not found.isascii():  # after ASCII, the last byte is rather a letter of Latin-1
+            return found
+    return text.decode("latin-1")
 
 
 def encode_evlr_header(user_id: bytes, record_id: int, length: int, description: bytes) -> bytes:
