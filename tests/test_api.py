@@ -290,7 +290,12 @@ def test_a_strip_that_fails_is_in_the_result(strips, tmp_path):
         ({"overwrite": "no"}, "must be True or False"),
         ({"jobs": "4"}, "must be a whole number"),
         ({"bbox": "1,2,3,4"}, "must be a tuple or None"),
+        ({"where": 3}, "--where 3: must be Condition or text or None"),
+        ({"chain": 3}, "--chain 3: must be Chain or a path or text or None"),
+        ({"system": {}}, "--system {}: must be Survey or a path or text or None"),
         ({"chain": "fast", "flight_height": 800.0}, None),
+        ({"chain": "fast", "bbox": np.array([-1e9, -1e9, 1e9, 1e9]), "classes": np.arange(256, dtype=np.uint8),
+          "overwrite": np.True_, "point_format": np.int64(6), "flight_height": np.float32(800.0)}, None),
     ],
 )
 def test_wrong_options_start_nothing(strips, tmp_path, options, words):

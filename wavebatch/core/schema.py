@@ -95,8 +95,8 @@ def read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Rang
     return (hint,), None, None
 
 
-_LATE = ("Chain", "Condition", "Survey")
-"""Types that only Python gives; they take time to import."""
+_LATE = {name: type(name, (), {}) for name in ("Chain", "Condition", "Survey")}
+"""Stand for types that only Python gives, which are known by their names: they take time to import."""
 
 
 @frozen
@@ -138,7 +138,7 @@ class Declared(NamedTuple):
 @functools.cache
 def declared_options(kind: type) -> dict[str, Declared]:
     """The options of a dataclass by the names of their fields."""
-    hints = typing.get_type_hints(kind, localns=dict.fromkeys(_LATE, object), include_extras=True)
+    hints = typing.get_type_hints(kind, localns=_LATE, include_extras=True)
     declared = {one.name: one for one in fields(kind) if "option" in one.metadata}
     return {
         name: Declared(one.default, one.metadata["option"], *read_hint(hints[name])) for name, one in declared.items()
@@ -164,10 +164,13 @@ def check_options(options: Any) -> None:
         value, place = getattr(options, name), typed(one.words.name or name)
         if value is None and type(None) in one.kinds:
             continue
+        if hasattr(value, "tolist"):  # of NumPy: reports are JSON
+            value = value.tolist()
+            object.__setattr__(options, name, value)
         if one.choices is not None and value not in one.choices:
             raise ConfigError(f"{place} {value!r}: choose {', '.join(map(str, one.choices))}")
-        forms = [_FORMS.get(typing.get_origin(kind) or kind, (object, "")) for kind in one.kinds]
-        if not any(isinstance(value, form) for form, _ in forms):
+        forms = [_FORMS.get(typing.get_origin(kind) or kind, (kind, kind.__name__)) for kind in one.kinds]
+        if not any(isinstance(value, form) or type(value).__name__ == word for form, word in forms):
             raise ConfigError(f"{place} {value!r:.40}: must be {' or '.join(dict.fromkeys(word for _, word in forms))}")
         if one.limits is not None and not one.limits.hold(value):
             raise ConfigError(f"{place} {value!s:.20}: must lie {one.limits}")
