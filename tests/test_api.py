@@ -192,13 +192,20 @@ def test_waveforms_of_arrays_are_surveyed_and_decomposed(rng):
     centre, height = rng.uniform(20, 60, 2000), rng.uniform(20, 200, 2000)
     signal = height[:, None] * np.exp(-0.5 * ((np.arange(80) - centre[:, None]) / 2.3) ** 2)
     block = wb.WaveformBlock.from_samples(np.rint(12 + signal + rng.normal(0, 1, signal.shape)).astype(np.uint8))
-    survey = wb.survey([block])
-    assert survey.waveforms == 2000 and survey.system.sigma_ref == pytest.approx(2.3, rel=0.01)
+    survey = wb.survey(block)
+    assert survey == wb.survey([block]) and survey.waveforms == 2000
+    assert survey.system.sigma_ref == pytest.approx(2.3, rel=0.01)
     echoes = wb.auto_chain(survey).run(block, survey.system)
     assert np.array_equal(echoes.waveform, np.arange(2000))
     assert np.abs(echoes.time - centre).max() < 0.5
     with pytest.raises(wb.ConfigError, match="needs the points of a strip"):
         wb.survey([block], divergence=0.5)
+    for nothing in ([], [block.rows(slice(0))]):
+        with pytest.raises(wb.InputError, match="hold no waveform"):
+            wb.survey(nothing)
+    for other in (block.samples, [block.samples], None):
+        with pytest.raises(wb.ConfigError, match="give a strip, its path, or blocks of waveforms"):
+            wb.survey(other)
 
 
 def test_a_strip_without_waveforms_cannot_be_surveyed(strips, tmp_path, edit_points):

@@ -332,7 +332,7 @@ def open_strip(path: Path | str, *, direction: str = "auto", headerless: bool = 
 
 
 def survey(
-    strip: Strip | Path | str | Iterable[WaveformBlock],
+    strip: Strip | Path | str | WaveformBlock | Iterable[WaveformBlock],
     *,
     waveforms: int | None = None,
     divergence: float | None = None,
@@ -343,7 +343,7 @@ def survey(
 
     Parameters
     ----------
-    strip : Strip, path, str or iterable of WaveformBlock
+    strip : Strip, path, str, WaveformBlock or iterable of WaveformBlock
         The strip, opened with `open_strip`, or its path; or waveforms of yours (`WaveformBlock.from_samples`), which
         are all looked at.
     waveforms : int, optional
@@ -366,6 +366,8 @@ def survey(
     ------
     InputError
         Where the strip cannot be read or holds no waveform.
+    ConfigError
+        Where it is neither a strip nor waveforms, or an option needs points that it does not have.
     """
     from wavebatch.surveying.choose_chain import read_sample  # `info` needs none of these
     from wavebatch.surveying.flat_ground import survey_angles
@@ -382,7 +384,11 @@ def survey(
     if not isinstance(strip, Strip):
         if divergence is not None or find_divergence:
             raise ConfigError("divergence: needs the points of a strip; leave it out for waveforms of your own")
-        sample = list(strip)
+        sample = list(strip) if isinstance(strip, Iterable) else [strip]
+        if not all(isinstance(block, WaveformBlock) for block in sample):
+            raise ConfigError("survey: give a strip, its path, or blocks of waveforms by `WaveformBlock.from_samples`")
+        if not any(map(len, sample)):
+            raise InputError("these blocks hold no waveform to be surveyed")
         return _with_decisions(with_look(survey_blocks(sample), sample))
     sample = read_sample(strip.reader, strip.scan, waveforms)
     if not sample:
