@@ -16,7 +16,15 @@ from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.reader import MOST_SLICES, RAYS_PER_SLICE, RaySample, StripReader, sample_rays
 from wavebatch.kernels.physics.radiometry import mean_haze
-from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, estimate_path, find_sensor, find_turn
+from wavebatch.surveying.sensor import (
+    UNKNOWN,
+    SensorRequest,
+    SensorSource,
+    _disagreement,
+    estimate_path,
+    find_sensor,
+    find_turn,
+)
 from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
 
@@ -336,6 +344,70 @@ def test_a_digitizer_whose_vectors_contradict_a_trajectory_is_named(tmp_path, ed
     strip = edit_points(strip, tmp_path / "b.las", turn)
     with pytest.raises(InputError, match="vectors of digitizer 3 are off the trajectory's rays, those of the others"):
         find(strip, trajectory=trajectory)
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (slice(0), "a tenth of the trajectory's rays"),
+        (slice(100, 301, 200), "a tenth of the trajectory's rays"),
+        (slice(0, 700, 2), "a tenth of the trajectory's rays"),
+        (slice(700, None, 30), "a tenth of the trajectory's rays"),
+        (slice(0, None, 2), "vectors of digitizer 1 are off"),
+    ],
+    ids=["no other", "two rays", "at other times", "ten rays", "at all times"],
+)
+def test_vectors_are_wrong_only_where_enough_others_agree_at_that_time(second, message):
+    """Two rays of a rare digitizer made good vectors wrong, where the trajectory was wrong for 30 % of the strip."""
+    vector = np.tile([0.0, 0.1, -1.0], (1000, 1))
+    ahead, digitizer = 700.0 * vector, np.ones(1000, np.uint8)
+    digitizer[second] = 7
+    ahead[(np.arange(1000) >= 700) & (digitizer == 1)] += [60.0, 0.0, 0.0]
+    rays = RaySample(np.arange(1000.0), ahead, vector, np.ones(1000), vector, digitizer)
+    with pytest.raises(InputError, match=message):
+        _disagreement(ahead, np.linalg.norm(ahead, axis=1), rays)
+
+
+def fly_level(view, height, *, seed=9, number=8000, degrees=0.0):
+    """Times, points, unit vectors and distances of one sensor; its roll drifts by `degrees`, vectors do not say so."""
+    time = START + np.sort(np.random.default_rng(seed).uniform(0.0, 3.0, number))
+    seconds = time - START
+    across = np.tan(np.radians(view / 2) * (1.0 - 2.0 * (50.0 * seconds % 1.0)))
+    unit = np.stack([np.full(number, 0.05), across, np.full(number, -1.0)], axis=1)
+    unit /= np.linalg.norm(unit, axis=1)[:, None]
+    far = height / -unit[:, 2]
+    ground = np.outer(seconds, [60.0, 0.0, 0.0]) + [0.0, 0.0, height] + far[:, None] * unit
+    roll = np.radians(degrees) * np.sin(2.7 * seconds + 1.0)
+    return time, ground, unit + np.cross(np.outer(roll, [1.0, 0.0, 0.0]), unit), far
+
+
+def true_and_stated(rays, ground, far):
+    found = estimate_path(rays, "pairs of returns")
+    off = np.linalg.norm(ground - found.trajectory.at(rays.time), axis=1) - far
+    return np.sqrt(np.mean(off**2)), found.error
+
+
+@pytest.mark.parametrize(("view", "height", "number"), [(60, 700, 8000), (75, 1500, 8000), (75, 1500, 20_000)])
+def test_wide_views_of_one_sensor_show_no_heights(view, height, number):
+    """Errors of directions miss by more the farther the ground is: ranges .2 m off had errors of 2.8 m."""
+    time, ground, unit, far = fly_level(view, height, number=number)
+    noise = 0.01 * np.random.default_rng(9).standard_normal((2, number, 3))
+    first, last = ground - 9.0 * unit + noise[0], ground + noise[1]
+    apart = last - first
+    rays = RaySample(time, 0.5 * (first + last), apart, (apart**2).sum(axis=1))
+    true, stated = true_and_stated(rays, ground, far)
+    assert true < stated < 0.7
+
+
+def test_noise_and_drifts_of_one_sensor_show_no_heights():
+    """By chance noise grows with the angle, too; a roll that drifts looks like sensors a few decimetres apart."""
+    for seed in range(4):
+        time, ground, unit, _ = fly_level(30, 700, seed=seed, number=2000)
+        unit += 3e-3 * np.random.default_rng(seed).standard_normal((2000, 3))
+        assert 0.8 < estimate_path(RaySample(time, ground, unit, np.ones(2000)), "direction vectors").error < 1.1
+    time, ground, unit, far = fly_level(30, 700, degrees=0.05)
+    true, stated = true_and_stated(RaySample(time, ground, unit, np.ones(8000)), ground, far)
+    assert true < stated < 1.6 * true
 
 
 @pytest.mark.parametrize(("above", "share"), [(20.0, 0.5), (20.0, 0.2), (20.0, 0.08), (5.0, 0.3), (0.0, 0.5)])

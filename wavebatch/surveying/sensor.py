@@ -81,6 +81,10 @@ LARGEST_MISS, MOST_MISS = 0.01, 0.1
 """Distance by which a ray misses the path, over its length, and share of such rays, from which they do not meet: the
 path of two sensors with the same times is half way between them. Those of real sensors miss it by a thousandth."""
 
+LEAST_AGREEING = 20
+"""Fewest rays of other digitizers that must agree with a trajectory, each after a ray that does not, for vectors to be
+wrong and not the trajectory."""
+
 SURE_HEIGHTS, LEAST_HEIGHTS = 4.0, 1e-3
 """Errors from which rays come from several heights: a twelfth of 1,000 rays shows that so, wherever they come from; and
 least standard deviation of these heights that counts, over the distance: drifts of attitude look like a tenth of it."""
@@ -527,12 +531,14 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
     angle, most = (quantile(angles, share) for share in (0.5, 1.0 - MOST_MISS))
     if most > LARGEST_ANGLE:
         share, off = ("half", angle) if angle > LARGEST_ANGLE else ("a tenth", most)
-        wrong = {
-            one: bool(np.mean(angles[digitizer == one] > LARGEST_ANGLE) > MOST_MISS)
-            for one in distinct(digitizer).tolist()
-        }
-        if not all(wrong.values()) and any(wrong.values()):
-            which = name_first([f"digitizer {one}" for one, is_wrong in wrong.items() if is_wrong])
+        off_ray = angles > LARGEST_ANGLE
+        wrong = [one for one in distinct(digitizer).tolist() if np.mean(off_ray[digitizer == one]) > MOST_MISS]
+        is_wrong = np.isin(digitizer, wrong)
+        # A trajectory that is wrong for a time agrees with channels that record nothing then, and with few rays.
+        last = np.maximum.accumulate(np.where(is_wrong, np.arange(len(angles)), 0))
+        agree = ~is_wrong & ~off_ray & (is_wrong & off_ray)[last]
+        if np.count_nonzero(agree) >= LEAST_AGREEING:
+            which = name_first([f"digitizer {one}" for one in wrong])
             raise InputError(
                 f"the packets' vectors of {which} are off the trajectory's rays, those of the others agree with them: "
                 "compute their vectors again, or leave out --trajectory"
@@ -639,7 +645,8 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
 def _measure_heights(away: np.ndarray, unit: np.ndarray) -> float:
     """Standard deviation of the places along the view from which rays come [m]; 0 where errors of rays explain it.
 
-    A ray that comes from h above the path misses it by h sin(angle); errors of its direction miss as much at any angle.
+    A ray that comes from h above the path misses it by h sin(angle); errors of its direction miss by the same angle
+    wherever it looks. So all is taken over the distance: wide views would show heights otherwise.
 
     away : f8 (n, 3)
         From the path to a point of the ray.
@@ -649,9 +656,10 @@ def _measure_heights(away: np.ndarray, unit: np.ndarray) -> float:
     view = unit.sum(axis=0)
     view = view / max(float(np.sqrt(view @ view)), 1e-30)
     side = view - (unit @ view)[:, None] * unit
-    tilt = (side * side).sum(axis=1)
+    tilt, far = (side * side).sum(axis=1), np.maximum((away * away).sum(axis=1), 1e-30)
     with np.errstate(invalid="ignore", divide="ignore"):
-        square = np.nan_to_num(np.einsum("ni,ni->n", away, side) ** 2 / tilt)
+        square = np.nan_to_num(np.einsum("ni,ni->n", away, side) ** 2 / tilt) / far
+    tilt = tilt / far
     off = tilt - tilt.mean()
     growth = float(off @ square) / max(float(off @ off), 1e-30)
     left = square - square.mean() - growth * off
