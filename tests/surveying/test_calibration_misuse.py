@@ -21,6 +21,7 @@ from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
+from wavebatch.surveying.calibrating import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
@@ -197,6 +198,19 @@ def calibrated(tmp_path_factory):
     write_targets(folder / "t.csv")
     calibrate(folder, "--divergence", 0.5, strips=["a.las"])
     return folder
+
+
+def test_what_a_term_is_known_to_at_the_edge_is_in_the_errors(tmp_path, calibrated, monkeypatch):
+    def fit(ties, anchors, seen):
+        return calibrate_flight.adjust.adjust_constants(ties, anchors), (0.2, 0.0, 0.0, 0.0), 0.4, None
+
+    monkeypatch.setattr(calibrate_flight, "fit_swath", fit)
+    known = load_calibration(calibrated / "cal.toml").channels[0].relative_error
+    for name in ("a.las", "t.csv"):
+        shutil.copy(calibrated / name, tmp_path)
+    found, _ = calibrate(tmp_path, "--scan-angle", strips=["a.las"])
+    for row in (*found.channels, *found.strips):
+        assert row.relative_error == pytest.approx(np.hypot(known, 0.4), rel=0.01)
 
 
 SENSOR = Sensor(**BASE, light=LIGHT)

@@ -1,5 +1,6 @@
 """Shipped pulses: where they come from, when a small strip gets one, and that no other sensor does."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,7 @@ def test_what_is_shipped():
         assert load_survey(folder / f"{one.name}.toml").survey.system == one.system, "--system takes it"
         assert one.spacing == (2.0 if one.name == "nasa-lvis" else 1.0)
         assert len(one.system.components) > 1 and find_source(one.system) is one
+        assert find_source(replace(one.system, sigma_ref=1.01 * one.system.sigma_ref)) is None
     # The outgoing pulses of the flights that they were measured on, and the impulse response of the Gemini's receiver.
     for name, width in (("geolas-q560", 4.05), ("neon-gemini", 15.1)):
         assert _half_width(KNOWN[name].system) == pytest.approx(width, rel=0.03)

@@ -163,6 +163,12 @@ def test_digitizers_that_record_otherwise_get_a_pulse_and_noise_of_their_own():
     assert survey.waveforms == 2112 and survey.figures.single_share > 0.98
 
 
+def test_shares_of_the_scene_are_those_of_all_digitizers():
+    seen, empty = record(gaussian, 8, n=600)[0], record(gaussian, 9, n=200, amplitude=(0.1, 0.2))[0]
+    found = survey_blocks([digitized(seen, 1), digitized(empty, 2, gain=0.1)], learn=False).figures
+    assert found.empty_share == pytest.approx(0.25, abs=0.01) and found.single_share == pytest.approx(0.75, abs=0.01)
+
+
 def test_a_digitizer_with_few_echoes_asks_of_weak_echoes_what_its_own_noise_does():
     """The main one's noise is a ten-thousandth of its echoes; the other's is a two-hundredth."""
     main = digitized(record(gaussian, 8, n=1500, amplitude=(5000, 20000), dtype="u2")[0], 1)
