@@ -577,25 +577,19 @@ def test_a_chance_of_zero_adds_nothing_for_what_scenes_do_not_show():
     assert 0.15 < said[0][0] < 0.22 and said[0][1:] == (0, True) and said[1] == (0.0, 0, False)
 
 
-@pytest.mark.parametrize(("light", "said"), [((1.0, 0.7), 0), ((0.7, 1.0), 2), ((1.0, 0.9), 2)])
-def test_channels_of_one_strip_contradict_constants_of_another_channel(rng, light, said):
-    """Over another landscape the surfaces hide it from each of them: 27 to 43 % off with 23 % stated."""
+def test_other_surfaces_at_two_wavelengths_are_no_constants_of_another_channel(rng):
+    """LAS states no wavelength: grass after soil is brighter in one channel, darker in the other (errors of 52 %)."""
     quantiles = np.linspace(15.0, 17.0, 10)
-    other = quantiles + 0.2 * np.where(np.arange(10) % 2, 1.0, -1.0)
-    rows = [
-        ChannelConstant(number, 0, 2e-8, 0.03, scene=tuple(quantiles + np.log(gain)))
-        for number, gain in ((1, 1.0), (2, 0.7))
-    ]
-    scenes = {
-        (number, 0): tuple(other + np.log(gain) + 0.02 * rng.standard_normal(10))
-        for number, gain in zip((1, 2), light, strict=True)
-    }
-    known = Calibration(2e-8, 0.03, 0.22, channels=tuple(rows))
+    known, seen = (
+        {number: quantiles + np.log(reflectance) for number, reflectance in ((1, infrared), (2, green))}
+        for infrared, green in ((0.3, 0.2), (0.35, 0.15))
+    )
+    rows = tuple(ChannelConstant(number, 0, 2e-8, 0.03, scene=tuple(scene)) for number, scene in known.items())
+    patches = 0.2 * np.where(np.arange(10) % 2, 1.0, -1.0)
+    scenes = {(one, 0): tuple(scene + patches + 0.02 * rng.standard_normal(10)) for one, scene in seen.items()}
     found = Setting(None, {}, scenes, {}, (1.0, 0.0), NO_CHANGE, None)
-    growth, lines, _ = compare_setting(known, found, SystemPulse(2.0))
-    lines = [line for line in lines if "constants of another channel" in line]
-    most = abs(np.log(light[1] / light[0] / 0.7))
-    assert len(lines) == said and growth > np.expm1(0.9 * most) and (said or growth < 0.3)
+    growth, lines, _ = compare_setting(Calibration(2e-8, 0.03, 0.22, channels=rows), found, SystemPulse(2.0))
+    assert not lines and 0.1 < growth < 0.35
 
 
 @pytest.mark.slow

@@ -145,11 +145,6 @@ def compare_setting(
     """
     growth, lines, notes = 0.0, [], []
     unseen = usual
-    scenes = {
-        (row.digitizer, row.scanner): np.subtract(seen, row.scene)
-        for row in calibration.channels
-        if len(row.scene) == len(seen := found.scenes.get((row.digitizer, row.scanner), ())) > 0
-    }
 
     def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
         nonlocal growth
@@ -178,17 +173,6 @@ def compare_setting(
         alike, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
         chance = calibration.change_chance
         change = change or settings.compare_scenes(scene or (), row.scene, louder, chance=chance, usual=usual)
-        rest = [one for channel, one in scenes.items() if channel != (row.digitizer, row.scanner)]
-        if ground is None and rest:
-            # Channels of one strip see the same surfaces, which then explain nothing. Either may be the wrong one.
-            alone = scenes[row.digitizer, row.scanner]
-            beside = settings.compare_scenes(alone, np.mean(rest, axis=0), chance=chance)
-            if beside.chance > settings.LIKELY:
-                growth = max(growth, math.expm1(abs(beside.shift)))
-                lines.append(
-                    f"calibration: light {which} over that of the strip's other channels is "
-                    f"{math.exp(beside.shift):.2f} times what it was: another gain, or constants of another channel"
-                )
         # What common ground shows is in the error, whatever changed it.
         more = math.expm1(max(change.error, abs(change.shift) * bool(ground or change.chance > settings.LIKELY)))
         growth, unseen = max(growth, more), 0.0
