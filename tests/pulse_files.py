@@ -29,15 +29,17 @@ class Sampling:
     bits: int = 8
     spacing: float = 1.0
     compression: int = 0
+    size: int = 104
+    """As the record states it; its fields are written in any case."""
 
     def encode(self) -> bytes:
         """The record."""
         front = struct.pack(
-            "<IIBBBBffBBHIHHfI", 104, 0, self.kind, self.channel, 0, self.duration_bits, self.scale, self.offset,
+            "<IIBBBBffBBHIHHfI", self.size, 0, self.kind, self.channel, 0, self.duration_bits, self.scale, self.offset,
             self.segment_bits, self.length_bits, self.segments, self.samples, self.bits, 0, self.spacing,
             self.compression,
         )  # fmt: skip
-        return front.ljust(104, b"\0")
+        return front.ljust(self.size, b"\0")
 
 
 @dataclass

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from batch_tools import run_one
+from batch_tools import make_job, run_one
 from commands import run_command, succeed
 from strips import cut_strip
 from writer_tools import data_file
 
 import wavebatch
+from wavebatch.batch.counts import RunReport
+from wavebatch.batch.report_file import LEAST_JUDGED, find_remarks, find_warnings
+from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import WARNINGS, StripWarning
 from wavebatch.files.las.header import read_header
 
@@ -165,13 +168,39 @@ def test_a_residual_threshold_below_the_noise_is_said(tiny_strip, tmp_path):
     stages = ("noise.pooled", "detect.maximum", "decompose.residual_loop")
     text = "\n".join(f'[[chain]]\nstage = "{name}"' for name in stages)
     rest = '[[chain]]\nstage = "attribute.position"\n'
-    for t_diff, raised in ((0.1, True), (50.0, False)):
-        chain = tmp_path / f"{t_diff}.toml"
-        chain.write_text(f'{text}\nt_diff = {t_diff}\nt_unit = "count"\n{rest}')
-        folder = tmp_path / f"out-{t_diff}"
+    for t_diff, unit, raised in ((0.1, "count", True), (50.0, "count", False), (0.1, "noise", False)):
+        chain = tmp_path / f"{t_diff}-{unit}.toml"
+        chain.write_text(f'{text}\nt_diff = {t_diff}\nt_unit = "{unit}"\n{rest}')
+        folder = tmp_path / f"out-{t_diff}-{unit}"
         succeed("run", tiny_strip, "-o", folder, "-c", chain)
         told = json.loads((folder / f"{tiny_strip.stem}.report.json").read_text())["remarks"]
         assert any("lies below the noise of" in line and "raised" in line for line in told) == raised
+
+
+@pytest.fixture
+def prepared(tiny_strip):
+    found = prepare_strip(make_job(tiny_strip))
+    found.scan.close()
+    return found
+
+
+@pytest.mark.parametrize("number", [LEAST_JUDGED - 1, LEAST_JUDGED])
+def test_few_waveforms_are_not_judged(prepared, number):
+    seen = dict.fromkeys(("points_in", "waveforms", "points_out"), number)
+    failed = RunReport(counts={**seen, "echoes": number}, flags={"AT_BOUND": number})
+    for report, code in ((failed, "failed-fits"), (RunReport(counts=seen), "empty")):
+        codes = [one.code for one in find_warnings(prepared, report, (), {})]
+        assert codes == [code] * (number == LEAST_JUDGED)
+
+
+@pytest.mark.parametrize(
+    ("counts", "said"),
+    [({}, ""), ({"UNCERTAIN": 3}, "none of 3 echoes has one; more"),
+     ({"UNCERTAIN": 2, "NO_LEVEL": 1}, "none of 3 echoes has one; 2 of them: more")],
+)  # fmt: skip
+def test_an_empty_column_is_said_with_the_reason_of_most_echoes(prepared, counts, said):
+    lines, _ = find_remarks(prepared, RunReport(no_data={"amplitude": counts}))
+    assert bool(said) == any(line.startswith(f"amplitude: {said}") for line in lines)
 
 
 def test_every_warning_has_a_listed_code():

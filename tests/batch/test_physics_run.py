@@ -14,6 +14,7 @@ from strips import take_turns
 from wavebatch.core.units import HALF_C
 from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.flat_ground import GroundReference
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
@@ -75,6 +76,18 @@ def test_errors_of_level_reflectances_take_the_slopes_of_the_strip(
     monkeypatch.setattr("wavebatch.surveying.flat_ground.measure_slope", lambda reader, scan: measured)
     succeed("run", tiny_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration)
     assert f"slope = {used}\n" in report(tmp_path)["chain"]
+
+
+def test_the_divergence_of_the_chain_is_compared_with_the_widths(tmp_path, tiny_strip, calibration, monkeypatch):
+    """The widths agree with the calibration, whose divergence the chain replaces."""
+    monkeypatch.setattr("wavebatch.surveying.flat_ground.sample_reference",
+                        lambda *arguments: GroundReference(arguments[3], 100, 1.1, 0.1))  # fmt: skip
+    chain = tmp_path / "c.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position",
+              "attribute.incidence_angle")  # fmt: skip
+    chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages) + "divergence = 3.0\n")
+    done = succeed("run", tiny_strip, "-o", tmp_path / "out", "-c", chain, "--calibration", calibration, "-q")
+    assert "a beam of 3 mrad contradicts" in done.stderr
 
 
 @pytest.mark.slow

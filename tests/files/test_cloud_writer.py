@@ -133,6 +133,7 @@ GEOTIFF, WKT_RECORD = Vlr(b"LASF_Projection", 34735, bytes(8)), Vlr(b"LASF_Proje
         ("1.3", 4, [OTHER_KEYS], ((1, 3), 1, 0)),
         ("keep", 4, [OTHER_KEYS], ((1, 3), 1, 0)),
         ("keep", 4, [OTHER_KEYS, "bit"], ((1, 3), 1, 0)),
+        ("keep", 4, [UTM_KEYS, "six"], ((1, 4), 6, 16)),
         ("1.4", 9, [GEOTIFF], ((1, 4), 6, 0)),
         ("1.4", 9, [GEOTIFF, WKT_RECORD], ((1, 4), 6, 16)),
         ("1.4", 9, [GEOTIFF, "extended"], ((1, 4), 6, 16)),
@@ -142,11 +143,13 @@ def test_version_format_and_legacy_fields_agree(tmp_path, las_version, made, vlr
     """Legacy counts are zero in point formats 6 to 10 (PDAL, copclib), and the WKT bit says which CRS record counts."""
     evlrs = [(b"LASF_Projection", 2112, b"PROJCRS\0")] * ("extended" in vlrs)
     bit = 16 * ("bit" in vlrs)
-    vlrs = [vlr for vlr in vlrs if vlr not in ("extended", "bit")]
+    wanted = 6 if "six" in vlrs else None
+    vlrs = [vlr for vlr in vlrs if vlr not in ("extended", "bit", "six")]
     points = write_source(
         tmp_path / "a.las", made, (1, 3) if made == 4 else (1, 4), vlrs=vlrs, evlrs=evlrs, global_encoding=bit
     )
-    layout, _ = copy(tmp_path / "a.las", tmp_path / "b.laz", points, COLUMNS, las_version=las_version)
+    plan = {"las_version": las_version, "point_format": wanted}
+    layout, _ = copy(tmp_path / "a.las", tmp_path / "b.laz", points, COLUMNS, **plan)
     header = read_header(tmp_path / "b.laz")
     assert (header.version, header.point_format, header.global_encoding & 16) == expected
     legacy, modern = header.counts

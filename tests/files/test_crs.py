@@ -160,6 +160,7 @@ def test_units_that_nobody_knows_are_no_metres(directory, doubles):
         (keys(short(1024, 1), short(3072, 2263), short(4096, 6360)), b"x|", "EPSG:2263+6360", "EPSG:2263"),
         (keys(short(1024, 1), short(3072, 25832)), b"", "EPSG:25832", "EPSG:25832"),
         (keys(short(1024, 2), short(2048, 4326)), b"", "EPSG:4326", "EPSG:4326"),
+        (keys(short(1024, 1), short(3072, 1024)), b"", "EPSG:1024", "EPSG:1024"),  # the least code
         (keys(short(1024, 1), short(3072, 32767)), b"mine|", "GeoTIFF: mine", None),
         (keys(short(1024, 1)), b"", "GeoTIFF keys", None),
         # Leica's ALSPP: the code of the CRS stands where that of the unit belongs.

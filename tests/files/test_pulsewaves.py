@@ -28,8 +28,8 @@ def _write(tmp_path, rng, number=40, **more):
         near = [(int(rng.integers(0, 999)), rng.integers(0, 65535, int(rng.integers(0, 30)))) for _ in range(index % 4)]
         far = [(0, rng.integers(0, 2**32 - 1, 5)) for _ in range(2)]
         pulses.append(Pulse([sent, near, far], time=index))
-    fixed = (Sampling(kind=1, duration_bits=0, length_bits=0, samples=6),
-             Sampling(duration_bits=0, length_bits=0, samples=9))  # fmt: skip
+    fixed = (Sampling(kind=1, duration_bits=0, length_bits=0, samples=6, size=0),  # shorter than its fields
+             Sampling(duration_bits=0, length_bits=0, samples=9, size=0))  # fmt: skip
     file = PulseFile({1: VARIED, 9: fixed}, pulses, extra=3, **more)
     return file, file.write(tmp_path / "a.pls")
 

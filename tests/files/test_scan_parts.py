@@ -123,8 +123,9 @@ def test_a_part_of_few_points_before_a_border_is_not_cut_off(strip):
         assert reader.cut_scan(3) == [(0, units // 3), (units // 3, 2 * units // 3), (2 * units // 3, units)]
     with open_strip(strip, part_units=4) as reader:
         assert len(reader.cut_scan(1000)) == units // 4
-    with open_strip(strip, window=UNIT) as reader:  # a window of several units
-        assert reader.cut_scan(3) == [(0, units)]
+    for window, parts in ((UNIT - 64, 3), (UNIT - 63, 1), (UNIT, 1)):  # of the window and a run of points
+        with open_strip(strip, window=window) as reader:
+            assert len(reader.cut_scan(3)) == parts
 
 
 def test_a_strip_without_points_is_one_part():
