@@ -453,6 +453,14 @@ def test_a_few_rays_of_every_place(wide_strip):
     np.testing.assert_array_equal(vectors.direction, again.direction)
 
 
+def test_a_sample_of_rays_is_no_smaller_than_asked(tmp_path):
+    """Steps that are no whole numbers took a tenth fewer; a strip of one place is read at both ends."""
+    strip = write_strip(tmp_path / "a.las", [Facet(0.3)], Sensor(rate=5000.0, n_samples=40), 2048)
+    with StripReader(strip) as reader, reader.scan() as scan:
+        vectors, _ = sample_rays(reader, scan)
+    assert 2 * RAYS_PER_SLICE <= len(vectors.time) < 2.2 * RAYS_PER_SLICE
+
+
 def wobble(rng, level):
     """Motion of an aircraft besides its course: sinusoids of 0.03 to 2 Hz; the slow ones are `level` m large."""
     frequency = np.geomspace(0.03, 2, 24)

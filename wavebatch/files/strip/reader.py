@@ -441,7 +441,8 @@ LEAST_PAIRS, SCALE_SPREAD = 20, 0.05
 """Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles."""
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-"""What steps through a strip have over a whole number: those that are one see one sensor only where two take turns."""
+"""What steps through a strip have over a whole number, the next smaller one: those that are whole see one sensor only
+where two take turns."""
 
 _SLICES_PER_UNIT = 4
 _LEAST_RATIO, _LARGEST_RATIO = 0.3, 3.0
@@ -470,8 +471,8 @@ class RaySample(NamedTuple):
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySample]:
     """Return the rays of a strip from packet vectors, and those from pulses with two returns.
 
-    At most RAYS_PER_SLICE rays at each of about MOST_SLICES places. Of units that are sorted by place, not time, rays
-    from all over the unit are added: each of its places has rays of a short time only.
+    RAYS_PER_SLICE rays, or somewhat more, at each of about MOST_SLICES places. Of units that are sorted by place, not
+    time, rays from all over the unit are added: each of its places has rays of a short time only.
     """
     kept, pairs = [], []
 
@@ -491,7 +492,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
         digitizer, first = points["wavepacket_index"], place[far]
         pairs.append(RaySample(time[first], middle, apart[far], square[far], away[first], digitizer[first]))
         step = len(points) // RAYS_PER_SLICE
-        rows = np.arange(0, len(points), step + GOLDEN if step > 1 else 1).astype(np.int64)
+        rows = np.arange(0, len(points), step - 1 + GOLDEN if step > 1 else 1).astype(np.int64)
         rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
         kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows], digitizer[rows]))
         return float(time[0]), bool(np.count_nonzero(time[1:] < time[:-1]) > MIXED * len(time))
