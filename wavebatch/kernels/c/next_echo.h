@@ -22,14 +22,19 @@ INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
     return sum_lanes(sum);
 }
 
-/* Weight of a sample in directions of the residual: clipped samples may not count. */
-INLINE lanes counted(const Window *w, int64_t v) {
-    const lanes weight = w->is_weighted ? w->weight[v] : ALL(1);
-    return w->any_clipped ? pick(w->clipped[v] != 0.f, ALL(0), weight) : weight;
+/* The next two directions after the three that a fit of an echo removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. */
+INLINE void find_directions(const Window *w, float time, float inverse, Basis row, int weighed, int clipped, lanes *third, lanes *fourth) {
+    for (int64_t v = 0; v < w->vectors; v++) {
+        const lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
+        const lanes once = row.by_width[v] * z, twice = once * z;
+        lanes weight = weighed && w->is_weighted ? w->weight[v] : ALL(1);
+        if (clipped && w->any_clipped) weight = pick(w->clipped[v] != 0.f, ALL(0), weight); /* they may not count */
+        third[v] = (once * 8.f - row.by_time[v] * 12.f) * weight;
+        fourth[v] = (twice * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
+    }
 }
 
-/* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. The directions are the next
-   two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. Where levels are free, rows of the
+/* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. Where levels are free, rows of the
    fit lack their share of l, and z^2 times that would be more than the pulse: pulses are evaluated anew. */
 static void hermite_moments(const Settings *s, Work *work, const Fit *fit) {
     const Window *w = &work->window;
@@ -44,12 +49,7 @@ static void hermite_moments(const Settings *s, Work *work, const Fit *fit) {
         const int64_t next = anew ? n : k * n; /* from the pulse to its slopes */
         const Basis row = {first, first + next, first + 2 * next, third};
         if (anew) evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
-        for (int64_t v = 0; v < n; v++) {
-            const lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
-            const lanes once = row.by_width[v] * z, twice = once * z, weight = anew ? counted(w, v) : ALL(1);
-            third[v] = (once * 8.f - row.by_time[v] * 12.f) * weight;
-            fourth[v] = (twice * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
-        }
+        find_directions(w, time, inverse, row, anew, anew, third, fourth);
         if (anew) { take_level_off(w, third); take_level_off(w, fourth); }
         work->h3[j] = multiply(n, third, residual) / sqrt(fmax(multiply(n, third, third), 1e-12)) / w->std;
         work->h4[j] = multiply(n, fourth, residual) / sqrt(fmax(multiply(n, fourth, fourth), 1e-12)) / w->std;
@@ -85,12 +85,7 @@ static void whitened_moments(const Settings *s, Work *work, const Fit *fit) {
         const Echo echo = {fit->parameters[j], fit->parameters[k + j], fit->parameters[2 * k + j], 0};
         const float time = echo.time, inverse = 1 / echo.width;
         evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
-        for (int64_t v = 0; v < n; v++) {
-            lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
-            lanes once = row.by_width[v] * z, twice = once * z, weight = w->is_weighted ? w->weight[v] : ALL(1);
-            third[v] = (once * 8.f - row.by_time[v] * 12.f) * weight;
-            fourth[v] = (twice * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
-        }
+        find_directions(w, time, inverse, row, 1, 0, third, fourth);
         double *moment[] = {work->h3 + j, work->h4 + j};
         for (int q = 0; q < 2; q++) {
             lanes *direction = q ? fourth : third;
