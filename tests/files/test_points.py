@@ -300,7 +300,7 @@ def test_a_panic_of_the_decoder_is_one_line_and_says_nothing_itself(tmp_path, mo
     with open_file(path, 1) as file:
         file.write(make_rows(1, 10))
         file.commit()
-    monkeypatch.setattr(read_points.LazPoints, "_decode_whole", _panic)
+    monkeypatch.setattr(read_points.lazrs, "decompress_points", _panic)
     with CloudReader(path) as reader, pytest.raises(InputError, match="cannot be decompressed .index out of bounds.;"):
         list(reader.read_pieces())
     assert capfd.readouterr().err == ""

@@ -10,7 +10,6 @@ from commands import succeed as call
 from helpers_scenes import make_scene
 
 from wavebatch.core.waveforms import Radiometry, SystemPulse
-from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.flat_ground import LEAST_NEIGHBOURS, GroundReference, Slopes, choose_radius, measure_reference
 from wavebatch.tools.simulate import find_scene, simulate_strip
@@ -32,8 +31,7 @@ def test_the_radius_of_neighbourhoods_holds_enough_points(tmp_path):
     simulate_strip("village", tmp_path / "v.las", pulses=900, seed=3, flight=sparse)
     xyz = laspy.read(tmp_path / "v.las").xyz
     apart = np.sort(np.linalg.norm(xyz[:, None] - xyz, axis=2), axis=1)[:, LEAST_NEIGHBOURS * 3 // 2 - 1]
-    with StripReader(tmp_path / "v.las") as reader, reader.scan() as scan:
-        assert choose_radius(reader, scan) == pytest.approx(np.ceil(10 * np.quantile(apart, 0.9)) / 10)
+    assert choose_radius(xyz) == pytest.approx(np.ceil(10 * np.quantile(apart, 0.9)) / 10)
 
 
 def write_targets(path, strip):

@@ -184,7 +184,7 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
             steps = []
             for step in job.chain.steps:
                 if step.stage.second_pass is not None and step.effective()["radius"] == 0:
-                    radius = flat_ground.choose_radius(reader, scan)
+                    radius = flat_ground.choose_radius(flat_ground.read_middle(reader, scan))
                     step = replace(step, parameters={**step.parameters, "radius": radius})
                 elif step.stage.name == "attribute.level_reflectance" and not step.parameters:
                     slope = max(step.effective()["slope"], round(flat_ground.measure_slope(reader, scan), 1))

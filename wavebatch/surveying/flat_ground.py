@@ -119,23 +119,6 @@ class GroundReference:
         return abs(ratio - 1.0) * max(1.0, 0.5 * (ratio + 1.0))
 
 
-def choose_radius(reader: StripReader, scan: StripScan) -> float:
-    """Choose the radius of neighbourhoods by the distance between the points of a strip.
-
-    Parameters
-    ----------
-    reader : StripReader
-    scan : StripScan
-
-    Returns
-    -------
-    float
-        Radius [m] in which nine tenths of the points have half more than LEAST_NEIGHBOURS, and these lie on more than
-        two scan lines; at least 1.5, at most 12.
-    """
-    return _choose_radius(_read_middle(reader, scan))
-
-
 def measure_slope(reader: StripReader, scan: StripScan) -> float:
     """Measure how steep the surfaces of a strip are.
 
@@ -149,7 +132,7 @@ def measure_slope(reader: StripReader, scan: StripScan) -> float:
     float
         Slope [deg] that 84 % of the sampled planes in the middle of the strip do not exceed; 0 where there are too few.
     """
-    xyz = _read_middle(reader, scan)
+    xyz = read_middle(reader, scan)
     if len(xyz) < ENOUGH_TO_LEARN:
         return 0.0
     some, (around, radius) = xyz[:: max(len(xyz) // ENOUGH_SLOPES, 1)], _surround(xyz)
@@ -161,7 +144,7 @@ def measure_slope(reader: StripReader, scan: StripScan) -> float:
     return quantile(known, 0.84) if len(known) >= ENOUGH_TO_LEARN else 0.0
 
 
-def _read_middle(reader: StripReader, scan: StripScan) -> np.ndarray:
+def read_middle(reader: StripReader, scan: StripScan) -> np.ndarray:
     """Places of the points in the middle of a strip, as `_list_places` has them."""
     units = reader.unit_count()
     return _list_places(reader, reader.read_unit(units // 2, scan)) if units else np.empty((0, 3))
@@ -175,11 +158,24 @@ def _list_places(reader: StripReader, unit: Unit) -> np.ndarray:
 
 def _surround(xyz: np.ndarray) -> tuple[Surroundings, float]:
     """Points in which neighbours are looked for, and the radius for that [m]."""
-    radius = _choose_radius(xyz)
+    radius = choose_radius(xyz)
     return Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)]), radius
 
 
-def _choose_radius(xyz: np.ndarray) -> float:
+def choose_radius(xyz: np.ndarray) -> float:
+    """Choose the radius of neighbourhoods by the distance between points.
+
+    Parameters
+    ----------
+    xyz : float64 (n, 3), m
+        From `read_middle`.
+
+    Returns
+    -------
+    float
+        Radius [m] in which nine tenths of the points have half more than LEAST_NEIGHBOURS, and these lie on more than
+        two scan lines; at least 1.5, at most 12.
+    """
     number = LEAST_NEIGHBOURS * 3 // 2
     if len(xyz) <= number:
         return RADII[0]

@@ -86,13 +86,9 @@ class AreaGrid:
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
-    def place(self, cloud: Path) -> AreaGrid:
-        """The division in the coordinates of a cloud."""
-        return self
-
-    def miss(self, cloud: Path) -> str:
-        """Says that no area lies in the cloud, once it is placed; empty where one does."""
-        return ""
+    def place(self, cloud: Path) -> tuple[AreaGrid, str]:
+        """The division in the coordinates of a cloud, and a line that says that no area lies there, else empty."""
+        return self, ""
 
 
 class PolygonSet:
@@ -113,14 +109,11 @@ class PolygonSet:
         """As AreaGrid.describe."""
         return OUTSIDE if number == _OUTSIDE else Area("polygon", self.polygons[number].name)
 
-    def place(self, cloud: Path) -> PolygonSet:
+    def place(self, cloud: Path) -> tuple[PolygonSet, str]:
         """As AreaGrid.place; raises as `Polygon.place`."""
         header = read_header(cloud)
-        return PolygonSet([polygon.place(cloud, header) for polygon in self.polygons])
-
-    def miss(self, cloud: Path) -> str:
-        """As AreaGrid.miss."""
-        return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
+        placed = [polygon.place(cloud, header) for polygon in self.polygons]
+        return PolygonSet(placed), describe_miss([ring for polygon in placed for ring in polygon.rings], header)
 
 
 Division = AreaGrid | PolygonSet
@@ -415,8 +408,9 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter,
         by_time = pulses_told_apart(reader)  # by all points
         reader.select(chosen)
         placed = [division.place(path) for division in divisions]
-        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=list(map(AreaTally, placed)))
-        tally.notes = [line for division in placed for line in [division.miss(path)] if line]
+        areas = [AreaTally(division) for division, _ in placed]
+        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
+        tally.notes = [line for _, line in placed if line]
         tally.metres = reader.metres
         if math.isnan(reader.metres[0]):
             tally.notes.append(f"coordinates are {reader.unit}: returns have no distances; project the cloud to metres")

@@ -177,16 +177,14 @@ class LazPoints:
                 chunk = int(np.searchsorted(self._first, start + done, "right")) - 1
                 count = min(len(rows) - done, int(self._first[chunk + 1]) - start - done)
                 if count == self._first[chunk + 1] - self._first[chunk]:
-                    self._decode_whole(chunk, rows[done : done + count])
+                    # From memory: 8 % faster than from a file, which lazrs needs for a part of a chunk.
+                    data = np.frombuffer(self._read_chunk(chunk).getbuffer(), np.uint8)
+                    whole = rows[done : done + count].view(np.uint8).reshape(-1)
+                    lazrs.decompress_points(data, self._coding.payload, whole, False)
                 else:
                     self._decode_part(chunk, start + done, rows[done : done + count])
                 done += count
         return rows
-
-    def _decode_whole(self, chunk: int, rows: np.ndarray) -> None:
-        """From memory: 8 % faster than from a file, which lazrs needs for a part of a chunk."""
-        data = np.frombuffer(self._read_chunk(chunk).getbuffer(), np.uint8)
-        lazrs.decompress_points(data, self._coding.payload, rows.view(np.uint8).reshape(-1), False)
 
     def _decode_part(self, chunk: int, start: int, rows: np.ndarray) -> None:
         if chunk != self._chunk or start < self._next:

@@ -202,14 +202,9 @@ def _as_table(echoes: dict[str, np.ndarray], row: np.ndarray | None = None) -> l
 
 def _as_structure(kind: Any, law: Any, points: str) -> Any:
     """The structure of a law whose curve has this name; it holds the arrays to which it points."""
-    curve = _as_curve(getattr(law, points))
-    structure = kind(**law._asdict() | {points: curve})
-    structure.arrays = curve.arrays
+    curve = np.array(getattr(law, points), np.float64).reshape(-1, 2)
+    arrays = [np.ascontiguousarray(column) for column in curve.T]
+    places = (place(array, np.float64) for array in arrays)
+    structure = kind(**law._asdict() | {points: library.CCurve(len(curve), *places)})
+    structure.arrays = arrays
     return structure
-
-
-def _as_curve(points: Points) -> library.CCurve:
-    arrays = [np.ascontiguousarray(column) for column in np.array(points, np.float64).reshape(-1, 2).T]
-    curve = library.CCurve(len(arrays[0]), *(place(array, np.float64) for array in arrays))
-    curve.arrays = arrays
-    return curve

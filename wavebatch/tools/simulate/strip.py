@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal
 
@@ -74,6 +75,9 @@ class TruthReader(Closing):
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
+        self._reading = partial(
+            reading_npz, self.path, "truth file of `wavebatch simulate`", "simulate the strip again"
+        )
         with self._reading():
             self._archive = zipfile.ZipFile(self.path)
             known = set(self._archive.namelist())
@@ -90,9 +94,6 @@ class TruthReader(Closing):
                 value = self.meta[key]
                 if type(value) not in (int, float) or not least <= value <= most:
                     raise ValueError(f"{key} of its description is {str(value)[:40]}")
-
-    def _reading(self) -> contextlib.AbstractContextManager[None]:
-        return reading_npz(self.path, "truth file of `wavebatch simulate`", "simulate the strip again")
 
     def close(self) -> None:
         """Closes the file."""
