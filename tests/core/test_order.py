@@ -1,9 +1,18 @@
-"""Order of the rows of a table: that of a sort by waveform, then time."""
+"""Sorting, medians and even samples."""
 
 import numpy as np
 import pytest
 
-from wavebatch.core.order import distinct, find_order, group_medians, known_median, median, quantile, quantiles
+from wavebatch.core.order import (
+    EvenSample,
+    distinct,
+    find_order,
+    group_medians,
+    known_median,
+    median,
+    quantile,
+    quantiles,
+)
 
 
 def test_any_rows_get_the_order_of_a_full_sort(rng):
@@ -70,3 +79,14 @@ def test_the_median_of_known_values_has_the_bits_of_numpy(dtype, shape, rng):
         values[rng.random(shape) < share] = np.nan
         for axis in (0, 1):
             np.testing.assert_array_equal(known_median(values, axis), np.nanmedian(values, axis=axis), strict=True)
+
+
+def test_an_even_sample_is_every_nth_row_however_they_come(rng):
+    columns = {"value": rng.normal(size=5000), "place": rng.normal(size=(5000, 2))}
+    for pieces in (1, 77, 5000):
+        sample = EvenSample(300)
+        for rows in np.array_split(np.arange(5000), pieces):
+            sample.add({name: values[rows] for name, values in columns.items()})
+        assert sample.seen == 5000 and sample.step == 32
+        for name, values in columns.items():
+            assert np.array_equal(sample.read()[name], values[:: sample.step])

@@ -1,18 +1,24 @@
-"""Output rows: the input's fields, our columns, and nothing else."""
+"""Headers, extra bytes and names of columns of files that are read and written."""
 
+import dataclasses
 
 import laspy
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.lib.recfunctions import repack_fields
 from writer_tools import facts_of, plan_output, random_points, write_source, write_strip
 
+from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.las.header import STANDARD_DTYPES, ExtraRecord, Vlr
+from wavebatch.files.cloud.column_names import _SHORT as SHORT
+from wavebatch.files.cloud.column_names import STYLES, describe, describe_roundings, normalise, resolve, style_columns
+from wavebatch.files.las import header as las
 
 VERSIONS = {4: (1, 3), 5: (1, 3), 9: (1, 4), 10: (1, 4)}
-GEOTIFF = Vlr(b"LASF_Projection", 34735, bytes(8))
-WKT = Vlr(b"LASF_Projection", 2112, b"PROJCRS\0")
+GEOTIFF = las.Vlr(b"LASF_Projection", 34735, bytes(8))
+WKT = las.Vlr(b"LASF_Projection", 2112, b"PROJCRS\0")
 
 
 def fields_of(rows, point_format):
@@ -23,7 +29,7 @@ def fields_of(rows, point_format):
 
 def plain(rows, point_format):
     """The standard part of rows, as an array of the bare point format."""
-    return repack_fields(rows[list(STANDARD_DTYPES[point_format].names)])
+    return repack_fields(rows[list(las.STANDARD_DTYPES[point_format].names)])
 
 
 @pytest.mark.parametrize(
@@ -92,12 +98,12 @@ def test_coordinates_are_rounded_kept_or_refused(tmp_path):
 
 
 SEVERAL = [
-    ExtraRecord.build("Amplitude", "u2", "dB", scale=0.01).with_range(np.array([0]), np.array([10000])),
-    ExtraRecord.build("real", "f8", ""),
-    ExtraRecord.build("declared", "i4", "", no_data=-5),
-    ExtraRecord.build("bare", "u1", ""),
-    ExtraRecord(bytes([0, 0, 29, 0]) + b"normal".ljust(188, b"\0")),  # three floats, a deprecated type
-    ExtraRecord.undocumented("ExtraBytes", 5),
+    las.ExtraRecord.build("Amplitude", "u2", "dB", scale=0.01).with_range(np.array([0]), np.array([10000])),
+    las.ExtraRecord.build("real", "f8", ""),
+    las.ExtraRecord.build("declared", "i4", "", no_data=-5),
+    las.ExtraRecord.build("bare", "u1", ""),
+    las.ExtraRecord(bytes([0, 0, 29, 0]) + b"normal".ljust(188, b"\0")),  # three floats, a deprecated type
+    las.ExtraRecord.undocumented("ExtraBytes", 5),
 ]
 
 
@@ -114,7 +120,7 @@ def write_several(path):
 
 
 def test_a_name_that_is_no_utf_8_is_carried_as_one(tmp_path):
-    write_source(tmp_path / "a.las", 9, (1, 4), n=6, records=[ExtraRecord.build("Ta", "u2", "")])
+    write_source(tmp_path / "a.las", 9, (1, 4), n=6, records=[las.ExtraRecord.build("Ta", "u2", "")])
     data = (tmp_path / "a.las").read_bytes()
     assert data.count(b"Ta\0") == 1
     (tmp_path / "a.las").write_bytes(data.replace(b"Ta\0", b"T\xb0\0"))
@@ -125,7 +131,7 @@ def test_a_name_that_is_no_utf_8_is_carried_as_one(tmp_path):
 @pytest.mark.parametrize("name", [b"", b"same", b"intensity", b"x" * 32])
 def test_carried_names_are_told_apart(tmp_path, name):
     """laspy opens no file in which a name is there twice, or is that of a field."""
-    records = [ExtraRecord.build(one, "u2", "") for one in ("Ta", "Tb", "Tc")]
+    records = [las.ExtraRecord.build(one, "u2", "") for one in ("Ta", "Tb", "Tc")]
     write_source(tmp_path / "a.las", 9, (1, 4), n=6, records=records)
     data = (tmp_path / "a.las").read_bytes()
     for one in (b"Ta", b"Tb", b"Tc"):
@@ -134,7 +140,7 @@ def test_carried_names_are_told_apart(tmp_path, name):
     (tmp_path / "a.las").write_bytes(data)
     layout = plan_output(tmp_path / "a.las", ["amplitude"])
     names = [record.name for record in layout.extra_records]
-    assert len(set(names)) == 4 and "" not in names and not set(names) & set(STANDARD_DTYPES[9].names)
+    assert len(set(names)) == 4 and "" not in names and not set(names) & set(las.STANDARD_DTYPES[9].names)
     assert names == list(layout.extra_fields)
     begin = name[:30].decode()
     assert names[0] == (name.decode() if name in (b"same", b"x" * 32) else f"{begin} 2") and names[1].startswith(begin)
@@ -180,7 +186,7 @@ def test_kept_packets_keep_pointers_and_take_new_locations(tmp_path):
 
 
 def test_records_that_leave_no_room_are_refused(tmp_path):
-    points = random_points(STANDARD_DTYPES[6], 1)
+    points = random_points(las.STANDARD_DTYPES[6], 1)
     write_source(tmp_path / "a.las", 6, (1, 4), points=points)
     data = bytearray((tmp_path / "a.las").read_bytes())
     data[105:107], data[247:255] = (65535).to_bytes(2, "little"), bytes(8)
@@ -196,3 +202,289 @@ def test_records_that_leave_no_room_are_refused(tmp_path):
     (tmp_path / "a.las").write_bytes(data)
     with pytest.raises(InputError, match="point format 11 is not known"):
         plan_output(tmp_path / "a.las", [])
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "not a LAS or LAZ file"),
+        (b"LASF" + bytes(100), "not a LAS or LAZ file"),
+        (b"PK" + bytes(400), "not a LAS or LAZ file"),
+        (b"LASF" + bytes(20) + b"\x01\x09" + bytes(400), "LAS version 1.9 is not known"),
+        (b"LASF" + bytes(20) + b"\x01\x04" + bytes(400), "but points at byte 0"),
+    ],
+)
+def test_what_is_no_las_file_is_one_line(tmp_path, data, message):
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        las.read_header(tmp_path / "a.las")
+    assert str(caught.value).startswith(str(tmp_path / "a.las")) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stored", "text"),
+    [
+        ("Zürich".encode(), "Zürich"),
+        ("Zürich".encode("latin-1"), "Zürich"),
+        (b"Caf\xe9", "Café"),  # the first byte of a letter of UTF-8 that is not cut, for the field has room
+        (("ü" + "s" * 29 + "ü").encode()[:32], "ü" + "s" * 29),
+        (("s" * 29 + "üü").encode()[:32], "s" * 29 + "ü"),
+        (b"s" * 28 + b"Caf\xe9", "s" * 28 + "Café"),
+    ],
+)
+def test_texts_of_headers_are_utf_8_or_latin_1(stored, text):
+    assert las.decode_text(stored.ljust(32, b"\0")) == text
+
+
+def test_evlrs_end_where_the_file_does(tmp_path):
+    path = tmp_path / "a.las"
+    write_source(path, 6, (1, 4), evlrs=[(b"one", 1, b"1" * 10), (b"two", 2, b"")])
+    found, missing = las.find_evlrs(path, las.read_header(path))
+    assert [(evlr.user, evlr.record_id, evlr.length) for evlr in found] == [("one", 1, 10), ("two", 2, 0)]
+    assert missing == 0
+    with open(path, "ab") as file:
+        file.write(las.encode_evlr_header(b"three", 3, 2**63, b""))
+    header = las.read_header(path)
+    header.evlr_count = 2**32 - 1
+    found, missing = las.find_evlrs(path, header)
+    assert len(found) == 2 and missing == 2**32 - 3
+    header.evlr_start = header.offset_to_points + 1
+    assert las.find_evlrs(path, header) == ([], 2**32 - 1)
+    assert las.find_evlrs(path, dataclasses.replace(header, version=(1, 3), evlr_count=0)) == ([], 0)
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    path = tmp_path_factory.mktemp("strip") / "a.las"
+    write_strip(path, wkt="PROJCRS[...]")
+    return path
+
+
+@given(changes=st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), min_size=1, max_size=6))
+def test_any_damage_of_the_header_is_one_line_or_a_plan(strip, tmp_path, changes):
+    data = bytearray(strip.read_bytes())
+    for at, value in changes:
+        data[at] = value
+    path = tmp_path / "damaged.las"
+    path.write_bytes(data)
+    for keep in (False, True):
+        try:
+            plan_output(path, ["amplitude"], packets=facts_of(path) if keep else None)
+        except (InputError, ConfigError) as error:
+            assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("number", range(11))
+def test_fields_and_dimensions_are_those_of_laspy(number):
+    known = laspy.PointFormat(number)
+    assert las.STANDARD_DTYPES[number] == known.dtype()
+    assert las.list_dimensions(number) == tuple(known.dimension_names)
+
+
+TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+
+
+def as_laspy(record):
+    return laspy.vlrs.known.ExtraBytesStruct.from_buffer_copy(record.data)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_laspy_reads_what_we_declare(dtype):
+    record = las.ExtraRecord.build("name", dtype, "what it is [m]", no_data=7, scale=0.25)
+    record = record.with_range(np.array([1]), np.array([100]))
+    seen = as_laspy(record)
+    assert (seen.format_name(), seen.description, seen.dtype()) == ("name", b"what it is [m]", np.dtype(dtype))
+    assert list(seen.no_data) == [7] and list(seen.scale) == [0.25] and list(seen.offset) == [0]
+    assert list(seen._raw_min()) == [1] and list(seen._raw_max()) == [100]
+    assert record.no_data[0] == 7 and [values[0] for values in record.declared_range] == [1, 100]
+    bare = record.with_range(None, None)
+    assert bare.declared_range is None and not as_laspy(bare).min_is_relevant()
+
+
+@pytest.mark.parametrize("code", range(1, 31))
+def test_every_type_of_the_specification(code):
+    record = las.ExtraRecord(bytes([0, 0, code]) + bytes(189))
+    assert record.dtype == as_laspy(record).dtype()
+    length = (code - 1) // 10 + 1
+    no_data = record.with_no_data(np.arange(length) + 1).no_data
+    assert list(no_data) == list(range(1, length + 1))
+
+
+def test_texts_longer_than_the_record_are_refused():
+    with pytest.raises(ValueError, match="32 bytes"):
+        las.ExtraRecord.build("n" * 33, "f4", "")
+    with pytest.raises(ValueError, match="32 bytes"):
+        las.ExtraRecord.build("n", "f4", "\N{MICRO SIGN}" * 17)
+
+
+@pytest.mark.parametrize(
+    ("stored", "name"),
+    [(b"T\xb0", "T\N{DEGREE SIGN}"), (b"\xb0" * 32, "\N{DEGREE SIGN}" * 16), (b"a" * 31 + b"\xb0", "a" * 31),
+     (b"a" * 31 + b"\xc3", "a" * 31)],
+)
+def test_latin_1_texts_become_utf_8(stored, name):
+    record = las.ExtraRecord(bytes([0, 0, 3, 0]) + stored.ljust(32, b"\0") + bytes(124) + stored.ljust(32, b"\0"))
+    with pytest.raises(UnicodeDecodeError):
+        as_laspy(record).format_name()
+    readable = record.with_readable_texts()
+    assert as_laspy(readable).format_name() == readable.name == readable.description == name
+    assert readable.with_readable_texts() == readable and len(readable.data) == 192
+
+
+def test_undescribed_bytes_get_records_of_their_own():
+    known = las.ExtraRecord.build("a", "u2", "")
+    assert [(r.name, r.dtype.itemsize) for r in las.read_records(known.data, 2)] == [("a", 2)]
+    found = las.read_records(known.data, 302)
+    assert [(r.name, r.code, r.dtype.itemsize) for r in found] == [
+        ("a", 3, 2), ("ExtraBytes", 0, 231), ("ExtraBytes 2", 0, 69),
+    ]  # fmt: skip
+    assert las.read_records(known.data, 1)[0].dtype == np.dtype("u1")  # described, but not there
+    unknown = las.ExtraRecord(bytes([0, 0, 31]) + bytes(189))
+    assert [(r.name, r.dtype.itemsize) for r in las.read_records(unknown.data + known.data, 4)] == [("ExtraBytes", 4)]
+    named = las.ExtraRecord.build("ExtraBytes", "u1", "")
+    assert [r.name for r in las.read_records(named.data, 3)] == ["ExtraBytes", "ExtraBytes 2"]
+
+
+def test_fields_have_different_names_whatever_the_records_say():
+    records = [las.ExtraRecord.build(name, "u1", "") for name in ("", "", "intensity", "a", "a")]
+    assert las.build_dtype(1, records).names[-5:] == (" 2", " 3", "intensity 2", "a", "a 2")
+
+
+@given(
+    dtype=st.sampled_from([t for t in TYPES if t[0] in "ui"]),
+    ends=st.tuples(st.integers(-(2**63), 2**64), st.integers(-(2**63), 2**64)),
+)
+def test_chosen_no_data_lies_outside_the_values(dtype, ends):
+    info = np.iinfo(dtype)
+    least, largest = (int(np.clip(end, info.min, info.max)) for end in sorted(ends))
+    record = las.ExtraRecord.build("a", dtype, "")
+    empty = las.choose_no_data(record.with_range(np.array([least], dtype), np.array([largest], dtype)))
+    if empty is None:
+        assert largest - least >= info.max - info.min - 1 or least == largest
+    else:
+        assert empty.dtype == np.dtype(dtype) and not least <= int(empty[0]) <= largest
+        again = record.with_no_data(empty).no_data
+        assert again[0] == empty[0]
+
+
+def test_vendors_amplitude_keeps_clear_of_values_that_wrapped():
+    record = las.ExtraRecord.build("Amplitude", "u2", "", scale=0.01).with_range(np.array([0]), np.array([10000]))
+    empty = int(las.choose_no_data(record)[0])
+    assert 10000 + 20000 < empty < 65536 - 20000
+
+
+def test_no_data_without_any_evidence():
+    assert np.isnan(las.choose_no_data(las.ExtraRecord.build("a", "f4", ""))[0])
+    assert las.choose_no_data(las.ExtraRecord.build("a", "u2", "")) is None
+    same = las.ExtraRecord.build("a", "u2", "").with_range(np.array([5]), np.array([5]))
+    assert las.choose_no_data(same) is None, "no writer filled equal extremes in"
+    assert las.choose_no_data(las.ExtraRecord.undocumented("a", 3)) is None
+    assert list(las.choose_no_data(las.ExtraRecord.build("a", "u2", "", no_data=5))) == [5]
+    vector = las.ExtraRecord(bytes([0, 0, 29]) + bytes(189))
+    assert np.isnan(las.choose_no_data(vector)).tolist() == [True] * 3
+
+
+ALL = tuple(COLUMNS)
+WRITTEN = tuple(name for name, column in COLUMNS.items() if column.extra_bytes)
+NUMBERS = tuple(name for name in WRITTEN if name != "echo_flags")
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_every_style_writes_every_column_under_a_name_of_its_own(style):
+    columns = style_columns(ALL, style, ())
+    assert tuple(column.column for column in columns) == WRITTEN
+    names = [column.record.name for column in columns]
+    assert len({normalise(name) for name in names}) == len(names)
+    assert all(len(name.encode()) <= 32 for name in names)
+
+
+@pytest.mark.parametrize("column", COLUMNS.values(), ids=COLUMNS)
+def test_descriptions_fit_and_end_with_the_unit(column):
+    text = describe(column)
+    assert len(text.encode()) <= 32 and text.endswith(f"[{column.unit}]")
+    meaning = text.rpartition(" [")[0]
+    error = f"1 sigma of {column.name.removesuffix('_err')}"
+    assert not column.extra_bytes or meaning in (SHORT.get(column.name), column.meaning, error), "the meaning is cut"
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_styles_name_columns_that_exist(style):
+    assert set(STYLES[style]) <= set(COLUMNS)
+
+
+def test_collisions_with_prefixed_names_separators_and_standard_fields():
+    def named(columns, style, taken):
+        return [column.record.name for column in style_columns(columns, style, taken)]
+
+    assert named(["amplitude"], "wavebatch", ["Amplitude", "wb_amplitude"]) == ["wb2_amplitude"]
+    assert named(["echo_width"], "wavebatch", ["Echo Width"]) == ["wb_echo_width"]
+    assert named(["echo_width"], "asprs", ["Pulse width"]) == ["wb_pulse_width"]
+    assert named(["echo_width"], "pdal", ["echo_width"]) == ["wb_EchoWidth"]
+    assert named(["amplitude", "amplitude"], "opals", []) == ["Amplitude"]
+    assert named(["x", "y", "z", "range"], "wavebatch", ["X"]) == ["range"]
+    assert named(["range"], "pdal", []) == ["EchoRange"]
+
+
+def test_no_data_of_floating_point_columns_can_be_nan():
+    plain, nan = (
+        {column.column: column.record for column in style_columns(list(COLUMNS), "asprs", [], no_data)}
+        for no_data in ("-9999", "nan")
+    )
+    for name, record in plain.items():
+        if record.dtype.kind == "f":
+            assert record.no_data[0] == -9999 and np.isnan(nan[name].no_data[0]), name
+        else:
+            assert record == nan[name]
+    with pytest.raises(ConfigError, match="no_data '0': must be one of -9999, nan"):
+        style_columns(["amplitude"], "wavebatch", [], "0")
+
+
+def test_styles_that_round_say_so_with_step_and_limits():
+    (line,) = describe_roundings(style_columns(list(COLUMNS), "asprs", []))
+    assert line.startswith("echo_width: written as 'pulse width', rounded to 0.1 ns and kept within 0 to 6553.5 ns")
+    assert [line.split(":")[0] for line in describe_roundings(style_columns(list(COLUMNS), "riegl", []))] == [
+        "echo_width",
+        "reflectance",
+    ]
+    for style in ("wavebatch", "pdal", "opals"):
+        assert describe_roundings(style_columns(list(COLUMNS), style, [])) == []
+
+
+def test_unknown_names_are_one_line():
+    with pytest.raises(ConfigError, match="column 'amplitud' does not exist; did you mean 'amplitude'"):
+        style_columns(["amplitud"], "wavebatch", ())
+    with pytest.raises(ConfigError, match="column 'qqq' does not exist; known are amplitude, "):
+        style_columns(["qqq"], "wavebatch", ())
+    with pytest.raises(ConfigError, match="names 'x': must be one of wavebatch, asprs"):
+        style_columns([], "x", ())
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("name", NUMBERS)
+def test_what_is_no_number_becomes_the_declared_no_data(style, name):
+    (column,) = style_columns([name], style, ())
+    empty = column.record.no_data
+    assert empty is not None
+    stored = column.encode(np.array([np.nan, np.inf, -np.inf, 5.0]))
+    assert list(stored[:3]) == [empty[0]] * 3 and stored[3] != empty[0]
+
+
+def test_values_beyond_the_stored_type_become_its_nearest_value_never_no_data():
+    (width,) = style_columns(["echo_width"], "asprs", ())
+    assert list(width.encode(np.array([0.0, 0.01, 1e9, np.nan]))) == [1, 1, 65535, 0]
+    (reflectance,) = style_columns(["reflectance"], "riegl", ())
+    assert list(reflectance.encode(np.array([1.0, 0.1, 1e-300, 1e300, 0.0, -1.0]))) == [
+        0, -1000, -32767, 32767, -32768, -32768,
+    ]  # fmt: skip
+    (amplitude,) = style_columns(["amplitude"], "wavebatch", ())
+    assert list(amplitude.encode(np.array([1e300, 1.0]))) == [-9999.0, 1.0]
+
+
+def test_exact_names_come_before_those_that_are_alike_and_kinds_count_in_order():
+    ours, file = {"echo_width": "Pulse width", "amplitude": "wb_amplitude"}, {"Amplitude": "Amplitude", "z": "z"}
+    assert resolve("Amplitude", ours, file) == "Amplitude"
+    assert resolve("amplitude", ours, file) == "wb_amplitude"
+    assert resolve("AMPLITUDE", ours, file) == "wb_amplitude"
+    assert resolve("Echo Width", ours, file) == "Pulse width"
+    assert resolve("Z", ours, file) == "z"
+    assert resolve("width", ours, file) is None

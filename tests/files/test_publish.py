@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, never over another one, and leave nothing behind."""
+"""Files that appear whole or not at all, arrays on disk, and which files arguments name."""
 
 import errno
 import multiprocessing
@@ -7,12 +7,17 @@ import signal
 import subprocess
 import sys
 
+import click
+import numpy as np
 import pytest
+from commands import run_command
 
-from wavebatch.core.errors import InputError
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import publish
+from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.publish import Draft, is_stream, publish_together, refuse_existing, remove_stale
-from wavebatch.files.text_file import write_text
+from wavebatch.files.text_file import find_files, find_strips, write_text
 
 
 def write(target, text, *, overwrite=False):
@@ -248,3 +253,159 @@ def test_the_next_draft_in_a_folder_removes_what_killed_processes_left(tmp_path)
         assert not left.exists() and first.path.exists()
         with Draft(tmp_path / "b", overwrite=False):
             assert first.path.exists()
+
+
+def write_arrays(target, parts, **options):
+    with NpzWriter(target, {"place": np.dtype(("<i4", (3,))), "value": "<f4"}, **options) as writer:
+        for place, value in parts:
+            writer.add({"place": place, "value": value})
+        writer.publish({"size": 0.5, "text": "päper"})
+
+
+def test_numpy_reads_what_was_added(tmp_path, rng):
+    parts = [(rng.integers(-9, 9, (n, 3)), rng.normal(size=n)) for n in (4, 0, 300)]
+    for name in ("a.npz", "b.npz"):
+        write_arrays(tmp_path / name, parts)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with np.load(tmp_path / "a.npz") as file:
+        assert np.array_equal(file["place"], np.concatenate([place for place, _ in parts]))
+        assert np.array_equal(file["value"], np.concatenate([value for _, value in parts]).astype("f4"))
+        assert file["place"].dtype == "<i4" and file["size"] == 0.5 and str(file["text"]) == "päper"
+    write_arrays(tmp_path / "c.npz", [])
+    with np.load(tmp_path / "c.npz") as file:
+        assert file["place"].shape == (0, 3) and file["value"].shape == (0,)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz", "c.npz"]
+
+
+def test_nothing_is_left_of_what_fails(tmp_path):
+    with pytest.raises(InputError, match="make the folder first"):
+        NpzWriter(tmp_path / "gone" / "a.npz", {"value": "f4"})
+    (tmp_path / "a.npz").write_text("old")
+    with pytest.raises(InputError, match="exists already"):
+        NpzWriter(tmp_path / "a.npz", {"value": "f4"})
+    writer = NpzWriter(tmp_path / "b.npz", {"value": "f4"})
+    writer.add({"value": np.zeros(3)})
+    writer.close()
+    writer.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+    write_arrays(tmp_path / "a.npz", [], overwrite=True)
+    assert (tmp_path / "a.npz").read_bytes()[:2] == b"PK"
+
+
+@pytest.fixture
+def places(tmp_path):
+    for name in ("b.las", "a.LAZ", "a.wdp", "note.txt", ".hidden.las", "sub/c.laz"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    return tmp_path
+
+
+def _names(arguments):
+    return [path.name for path in find_strips(arguments)]
+
+
+def test_a_folder_means_its_strips_by_name(places):
+    assert _names([str(places)]) == ["a.LAZ", "b.las"]
+
+
+def test_globs_mean_strips_only(places):
+    assert _names([str(places / "*")]) == ["a.LAZ", "b.las"]
+    assert _names([str(places / "**" / "*")]) == ["a.LAZ", "b.las", "c.laz"]
+
+
+def test_a_list_is_relative_to_itself_and_may_hold_all_of_it(places):
+    (places / "strips.txt").write_text("# night of the 21st\n\nb.las\nsub\n*.LAZ\n")
+    assert _names([f"@{places / 'strips.txt'}"]) == ["b.las", "c.laz", "a.LAZ"]
+
+
+@pytest.mark.parametrize("name", ["@-", "@/dev/stdin"])
+def test_a_list_from_a_pipe_is_relative_to_where_the_command_runs(places, name):
+    """`find ... | wavebatch run @-`; names were looked for in /dev."""
+    command = [sys.executable, "-m", "wavebatch", "check", name]
+    done = subprocess.run(command, cwd=places, input="b.las\nsub\n", capture_output=True, text=True)
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["b.las", "sub/c.laz"]
+
+
+def test_a_strip_counts_once(places):
+    assert _names([str(places / "b.las"), str(places), str(places / "sub" / ".." / "b.las")]) == ["b.las", "a.LAZ"]
+
+
+def test_a_link_to_a_strip_that_was_given_is_named(places):
+    (places / "link.las").symlink_to(places / "b.las")
+    lines = []
+    assert find_strips([str(places / "b.las"), str(places / "link.las")], note=lines.append) == [places / "b.las"]
+    assert lines == [f"{places / 'link.las'}: is the same file as {places / 'b.las'}; it is used once"]
+    find_strips([str(places / "b.las"), str(places / "sub" / ".." / "b.las")], note=lines.append)
+    assert len(lines) == 1
+    done = run_command("run", places / "b.las", places / "link.las", "-o", places / "o")
+    assert lines[0] in done.stderr
+
+
+def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(places):
+    (places / "sub" / "b.laz").write_bytes(b"")
+    arguments = [str(places), str(places / "sub")]
+    assert [path.name for path in find_files(arguments)] == ["a.LAZ", "b.las", "b.laz", "c.laz"]
+    with pytest.raises(ConfigError, match="both outputs would be named b"):
+        find_strips(arguments)
+
+
+def test_a_name_with_brackets_is_a_name(places):
+    (places / "x[1].las").write_bytes(b"")
+    assert _names([str(places / "x[1].las")]) == ["x[1].las"]
+
+
+def test_a_named_file_that_is_missing_fails_later_and_alone(places):
+    assert _names([str(places / "none.las"), str(places / "b.las")]) == ["none.las", "b.las"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["empty"], "holds no .las or .laz"),
+        (["*.laz2"], "matches no"),
+        (["@none.txt"], "list cannot be read: No such file"),
+        (["@loop.txt"], "line 1: a list cannot name another list"),
+        (["@blank.txt"], "blank.txt: the list names no file; write one"),
+        (["b.las", "@blank.txt"], "the list names no file"),
+        ([], "no file given; name files"),
+        (["b.las", "sub/b.laz"], "both outputs would be named b"),
+    ],
+)
+def test_what_means_nothing_is_refused_in_one_line(places, monkeypatch, arguments, words):
+    monkeypatch.chdir(places)
+    (places / "empty").mkdir()
+    (places / "sub" / "b.laz").write_bytes(b"")
+    (places / "loop.txt").write_text("@loop.txt\n")
+    (places / "blank.txt").write_text("# nothing\n")
+    with pytest.raises(ConfigError, match=words) as caught:
+        find_strips(arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_command_that_takes_lists_refuses_an_empty_one_in_one_line(tmp_path):
+    """A command that takes `@list.txt` reads it with `find_files`: it must neither crash nor end well on nothing."""
+    (tmp_path / "empty.txt").write_text("# nothing yet\n\n")
+    (tmp_path / "targets.csv").write_text("name,x,y,radius,reflectance\na,0,0,1,0.5\n")
+    given = f"@{tmp_path / 'empty.txt'}"
+    more = {"run": ["-o", tmp_path / "out"], "calibrate": ["--targets", tmp_path / "targets.csv", "-o", tmp_path / "c"],
+            "slice": ["-o", tmp_path / "s.csv"], "voxelize": ["--size", "1", "-o", tmp_path / "v.npz"],
+            "grid": ["--column", "z", "-o", tmp_path / "g.tif"], "plot histogram": ["--column", "z"],
+            "plot map": ["--column", "z"], "plot section": ["--column", "z"]}  # fmt: skip
+    takers = list(_list_takers(main))
+    assert {"run", "info", "check", "stats", "plot histogram", "plot profile", *more} <= set(takers)
+    for words in takers:
+        rest = [*more.get(words, []), *(["-o", tmp_path / "p.png"] if words.startswith("plot") else [])]
+        result = run_command(*words.split(), given, *rest)
+        assert result.exit_code == 2, (words, result.output, result.exception)
+        (line,) = result.stderr.splitlines()
+        assert line == f"error: {given[1:]}: the list names no file; write one file, folder or pattern per line", words
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.txt", "targets.csv"]
+
+
+def _list_takers(command, path=""):
+    """Paths of the commands with an argument whose help says `@list.txt`."""
+    if isinstance(command, click.Group):
+        for name in command.list_commands(click.Context(command)):
+            yield from _list_takers(command.get_command(click.Context(command), name), f"{path} {name}".strip())
+    elif "@list.txt" in (command.help or ""):
+        yield path
