@@ -297,6 +297,9 @@ def test_a_strip_that_fails_is_in_the_result(strips, tmp_path):
         ({"overwrite": "no"}, "must be True or False"),
         ({"jobs": "4"}, "must be a whole number"),
         ({"bbox": "1,2,3,4"}, "must be a tuple or None"),
+        ({"classes": (2, "6")}, r"--classes \(2, '6'\): '6' must be a whole number"),
+        ({"classes": [2.5]}, r"--classes \[2.5\]: 2.5 must be a whole number"),
+        ({"bbox": (0, 0, "a", 1)}, "'a' must be a number"),
         ({"where": 3}, "--where 3: must be Condition or text or None"),
         ({"chain": 3}, "--chain 3: must be Chain or a path or text or None"),
         ({"system": {}}, "--system {}: must be Survey or a path or text or None"),
@@ -312,6 +315,11 @@ def test_wrong_options_start_nothing(strips, tmp_path, options, words):
     with pytest.raises(wb.ConfigError, match=words):
         wb.run(strips[0], tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_pulse_made_by_hand_needs_parts_of_the_right_type():
+    with pytest.raises(TypeError, match=r"noise of SystemPulse must be a ReceiverNoise, got 3\.0"):
+        wb.SystemPulse(2.0, noise=3.0)
 
 
 def test_an_option_that_does_not_exist_is_a_type_error(strips, tmp_path):

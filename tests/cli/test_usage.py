@@ -123,6 +123,16 @@ def test_a_full_stdout_is_named(place, words):
     assert (done.returncode, done.stderr) == (1, "error: stdout: cannot be written: No space left on device\n")
 
 
+@pytest.mark.parametrize("words", ["--help", "info strip.las", "check strip.las --json", "stats strip.las"])
+def test_a_reader_that_has_gone_ends_a_command_quietly_and_not_as_a_problem(place, words):
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-m", "wavebatch", *words.split()], stdout=writer, stderr=subprocess.PIPE,
+                          text=True, check=False)  # fmt: skip
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
 def test_a_cloud_without_permission_is_one_of_those_that_cannot_be_read(place, monkeypatch):
     """Not wrong usage: the others are counted. Root may read everything, so click's question is answered with no."""
     monkeypatch.setattr(os, "access", lambda *_, **__: False)

@@ -112,6 +112,9 @@ def begin_log(context: click.Context, parameter: click.Parameter, path: Path | N
 EXIT_USAGE = 2
 """Wrong usage or chain file; nothing was started."""
 
+EXIT_PIPE = 141
+"""The reader of stdout has gone: the exit code that shells give for cat and grep then."""
+
 
 _PLAIN = {
     "is not a valid integer range": "is no whole number",
@@ -172,8 +175,9 @@ def _errors_in_one_line() -> Iterator[None]:
         if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2: the whole help
             raise
         raise WrongUsage(error) from error
-    except BrokenPipeError:
-        raise
+    except BrokenPipeError:  # `| head` has what it wants; 1 would say that a problem was found
+        _drop_output(sys.stdout)
+        raise click.exceptions.Exit(EXIT_PIPE) from None
     except OSError as error:  # of help and version: commands report their own
         raise Unprinted(error) from error
 

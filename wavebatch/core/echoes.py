@@ -106,7 +106,7 @@ _COLUMNS = (
     Column("relative_reflectance", "f4", "DN ns m2", "not calibrated: reflectance in units of its own strip"),
     Column("incidence_angle", "f4", "deg", "angle between ray and surface normal"),
     Column("incidence_angle_normals", "f4", "deg", "angle between ray and normal of the plane of the points around"),
-    Column("range_err", "f4", "m", "one standard deviation of the place along the ray, of fit and returns"),
+    Column("range_err", "f4", "m", "one standard deviation of the place along the ray; that of range is range_error"),
     Column("range_error", "f4", "m", "error of range: of the place and of the sensor, one standard deviation"),
     Column("amplitude_err", "f4", "DN", "one standard deviation of amplitude"),
     Column("amplitude_normalized_err", "f4", "DN", "one standard deviation of amplitude_normalized"),

@@ -159,7 +159,10 @@ _FORMS: dict[type, tuple[type | tuple[type, ...], str]] = {
 
 
 def check_options(options: Any) -> None:
-    """Raise ConfigError for an option that is of another type, none of its choices, or outside of its range."""
+    """Raise ConfigError for an option that is of another type, none of its choices, or outside of its range.
+
+    The parts of a tuple have one type.
+    """
     for name, one in declared_options(options.__class__).items():
         value, place = getattr(options, name), typed(one.words.name or name)
         if value is None and type(None) in one.kinds:
@@ -172,6 +175,9 @@ def check_options(options: Any) -> None:
         forms = [_FORMS.get(typing.get_origin(kind) or kind, (kind, kind.__name__)) for kind in one.kinds]
         if not any(isinstance(value, form) or type(value).__name__ == word for form, word in forms):
             raise ConfigError(f"{place} {value!r:.40}: must be {' or '.join(dict.fromkeys(word for _, word in forms))}")
+        for form, word in [_FORMS[typing.get_args(kind)[0]] for kind in one.kinds if typing.get_origin(kind) is tuple]:
+            if wrong := [part for part in value if not isinstance(part, form)]:
+                raise ConfigError(f"{place} {value!r:.40}: {wrong[0]!r:.20} must be {word}")
         if one.limits is not None and not one.limits.hold(value):
             raise ConfigError(f"{place} {value!s:.20}: must lie {one.limits}")
 

@@ -496,9 +496,13 @@ class SystemPulse:
     """Pulse and noise of digitizers that record differently from the commonest one of the strip, by their index."""
 
     def __post_init__(self) -> None:
-        """Checks the one value that everything divides by."""
+        """Checks the one value that everything divides by, and the types of its parts: a wrong one would fail late."""
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
+        for name in ("noise", "defects", "widths", "radiometry"):
+            value, kind = getattr(self, name), type(self.__dataclass_fields__[name].default)
+            if not isinstance(value, kind):
+                raise TypeError(f"{name} of SystemPulse must be a {kind.__name__}, got {value!r}")
 
     def __repr__(self) -> str:
         """One line: kind and width of the pulse, and the noise."""
