@@ -502,7 +502,7 @@ class SystemPulse:
         for name in ("noise", "defects", "widths", "radiometry"):
             value, kind = getattr(self, name), type(self.__dataclass_fields__[name].default)
             if not isinstance(value, kind):
-                raise TypeError(f"{name} of SystemPulse must be a {kind.__name__}, got {value!r}")
+                raise TypeError(f"{name} of SystemPulse must be a {kind.__module__}.{kind.__name__}, got {value!r}")
 
     def __repr__(self) -> str:
         """One line: kind and width of the pulse, and the noise."""
