@@ -849,4 +849,5 @@ def test_both_extents_are_named(placed_strip):
     header = read_header(placed_strip)
     assert describe_miss([_box(placed_strip)], header) == "" == describe_miss([], header)
     text = describe_miss([_box(placed_strip) + 1e5], header)
-    assert f"{_box(placed_strip)[0, 0] + 1e5:.10g}" in text and f"{header.mins[0]:.10g}" in text and "another CRS" in text
+    west = _box(placed_strip)[0, 0] + 1e5
+    assert f"{west:.10g}" in text and f"{header.mins[0]:.10g}" in text and "another CRS" in text
