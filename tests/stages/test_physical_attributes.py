@@ -1,18 +1,21 @@
-"""Range, backscatter, reflectance and angle of echoes: recovered, with errors that hold; no-data, never zeros."""
+"""Attributes of echoes: positions, deviation from the pulse, energies, angles, reflectances, and their errors."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_scenes import make_block
 
 from wavebatch.core.echoes import EchoFlag, EchoTable, NoData, count_reasons
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
-from wavebatch.core.waveforms import Noise, Radiometry, ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, Radiometry, ReceiverNoise, ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.kernels.physics.radiometry import receive_power
+from wavebatch.stages import pulse_tables
+from wavebatch.stages.attribute.basic import position
 from wavebatch.stages.attribute.radiometry import echo_light, hide_edges
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step, load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
@@ -495,3 +498,92 @@ def test_level_reflectances_at_edges_are_left_out_with_the_reason():
     assert found[f"{name}_reason"].tolist() == [NoData.EDGE, 0, NoData.TOO_STEEP, NoData.EDGE]
     for key in (name, f"{name}_err"):
         assert np.isnan(found[key]).tolist() == [True, False, True, True] and found[key][1] == columns[key][1]
+
+
+ERROR = 0.02
+"""Of the fitted times [ns]."""
+
+
+def place(times, locations, **errors):
+    """x and range_err of echoes at `times` in one packet whose returns lie at `locations` [m along the ray]."""
+    block = WaveformBlock.from_samples(np.zeros((1, 80), np.uint8))
+    k = len(locations)
+    returns = ReturnTable(np.zeros(k, np.int32), np.array(locations, float), np.arange(k), np.zeros((k, 3)))
+    block = replace(block, returns=returns, direction=np.array([[HALF_C, 0.0, 0.0]]))
+    n = len(times)
+    echoes = EchoTable.build(np.zeros(n), np.array(times), np.full(n, 50.0), np.full(n, 2.0),
+                             time_err=np.full(n, ERROR))  # fmt: skip
+    system = SystemPulse(2.0).with_radiometry(**errors)
+    done = position(block, Noise(np.zeros(1, "f4"), np.ones(1, "f4")), system, echoes)
+    return (done.attributes["x"] - block.origin[0, 0]) / HALF_C, done.attributes["range_err"] / HALF_C
+
+
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
+def test_returns_that_contradict_each_other_widen_the_error(shift):
+    # The vendor gave one return for what the fit sees as a later centre: one of the two places must be wrong.
+    at, error = place([20.0, 40.0], [20.0, 40.0 - shift])
+    assert at == pytest.approx([20.0 - shift / 2, 40.0 - shift / 2], abs=1e-3)
+    assert error == pytest.approx(np.hypot(ERROR, shift / 2), rel=1e-3)
+
+
+def test_an_added_echo_has_the_error_of_its_packet():
+    at, error = place([20.0, 40.0, 60.0], [20.0, 39.0])
+    assert at[2] == pytest.approx(59.5, abs=1e-3) and error[2] == pytest.approx(np.hypot(ERROR, 0.5), rel=1e-3)
+
+
+@pytest.mark.parametrize("locations", [[19.6], [19.6, 39.61], [19.6, 39.6, 59.59]])
+def test_returns_that_agree_within_their_errors_leave_the_error_of_the_fit(locations):
+    _, error = place([20.0, 40.0, 60.0][: len(locations)], locations)
+    assert error == pytest.approx(ERROR, rel=1e-3)
+
+
+def test_returns_have_their_scatter_and_echoes_without_one_the_phase():
+    errors = {"returns": 0.03 * HALF_C, "phase": 0.29 * HALF_C}
+    for locations, other in (([19.6], 0.03), ([19.6, 39.6], 0.03), ([19.6, 38.6], 0.5), ([99.0], 0.29)):
+        _, error = place([20.0, 40.0], locations, **errors)
+        assert error == pytest.approx(np.hypot(ERROR, other), rel=1e-3)
+
+
+SYSTEMS = {
+    "gaussian": SystemPulse(2.0),
+    "learned": SystemPulse(2.0, components=((1.0, 0.0, 2.0), (0.1, 5.0, 2.2))),
+}
+
+
+def deviate_slowly(block, noise, system, echoes):
+    """Every echo on its own, in double precision: residual of the whole waveform, two projections."""
+    s = block.samples.shape[1]
+    x = np.arange(s, dtype=float)
+    shape, limits = pulse_tables.pulse_shape(system, 1.0), pulse_tables.shape_limits(system, 1.0)
+    whole = np.stack([echoes.amplitude, echoes.time, echoes.sigma], axis=1).astype(float)
+    lobes = [(1.0, 0.0, 0.0), *shape.components]
+    values = []
+    for row in range(len(echoes)):
+        waveform = echoes.waveform[row]
+        residual = block.samples[waveform] - float(noise.baseline[waveform])
+        for amplitude, time, width in pulse_tables.model_parameters(shape, limits, whole)[echoes.waveform == waveform]:
+            for weight, delay, extra in lobes:
+                wide = np.sqrt(width**2 + extra)
+                height = amplitude * weight * width / wide
+                residual = residual - height * np.exp(-0.5 * ((x - time - delay) / wide) ** 2)
+        amplitude, time, sigma = whole[row]
+        reach = min(int(np.ceil(5 * sigma)), s)
+        near = np.abs(x - np.rint(time)) <= reach
+        z = (x[near] - time) / sigma
+        total = 0.0
+        for direction in (8 * z**3 - 12 * z, 16 * z**4 - 48 * z**2 + 12):
+            direction = direction * np.exp(-0.5 * z * z)
+            total += (direction @ residual[near]) ** 2 / (direction @ direction)
+        std = float(noise.std[waveform])
+        values.append(np.sqrt(total) / std / (amplitude / std * np.sqrt(sigma)))
+    return np.array(values)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("scene", ["urban", "forest", "stiff.edge"])
+def test_deviation_is_that_of_a_plain_loop(scene, name):
+    system = SYSTEMS[name]
+    block, truth = make_block(scene, 120, seed=3)
+    noise = Noise(np.full(len(block), 12.2, np.float32), np.full(len(block), 1.1, np.float32))
+    found = STAGES["attribute.pulse_deviation"].function(block, noise, system, truth).attributes["pulse_deviation"]
+    assert found == pytest.approx(deviate_slowly(block, noise, system, truth), rel=1e-3, abs=1e-5)

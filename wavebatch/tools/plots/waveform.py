@@ -7,7 +7,7 @@ only the curves of the fitted pulses are computed again here. The echoes' parame
 (`list_echoes`), or rows of a CSV file (`format_echoes`).
 
 `see_block` gives what a detector saw: the signal in which it searched for echoes, with its threshold, by the function
-that its stage names (`searches`). tests/tools/test_detector_signals.py holds that the stages find echoes exactly where
+that its stage names (`searches`). tests/tools/test_plot_waveform.py holds that the stages find echoes exactly where
 these signals pass their thresholds.
 """
 
