@@ -322,6 +322,22 @@ def test_a_pulse_made_by_hand_needs_parts_of_the_right_type():
         wb.SystemPulse(2.0, noise=3.0)
 
 
+def test_wrong_use_is_said_in_the_words_of_the_user(strips, tmp_path):
+    with wb.open_strip(strips[0]) as strip:
+        survey, block = wb.survey(strip), next(strip.blocks())
+    with pytest.raises(TypeError, match="such as survey.system, not <class '.*Survey'>"):
+        wb.load_chain("fast").run(block, survey)
+    with pytest.raises(ValueError, match="is closed: use it inside its `with`"):
+        next(strip.blocks())
+    with pytest.raises(wb.ConfigError, match=r"--output .*out\.laz: this is a folder.* such as .*out$"):
+        wb.run(strips[0], tmp_path / "out.laz")
+    with pytest.raises(wb.StageError, match=r"got float64 .*round them"):
+        wb.WaveformBlock.from_samples(np.zeros((2, 8)))
+    with pytest.raises(wb.StageError, match="spacing must be above 0 ns, got 0"):
+        wb.WaveformBlock.from_samples(np.zeros((2, 8), np.uint8), spacing=0)
+    np.testing.assert_array_equal(wb.read_cloud(strips[0], "z")["z"], wb.read_cloud(strips[0], ["z"])["z"])
+
+
 def test_an_option_that_does_not_exist_is_a_type_error(strips, tmp_path):
     with pytest.raises(TypeError, match="has no option job; did you mean 'jobs'"):
         wb.run(strips[0], tmp_path, job=4)

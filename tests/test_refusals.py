@@ -102,6 +102,12 @@ RUNS = [
     (f"{RUN} --report - --progress json", 2, "stdout"),
     (f"{RUN} --json --report -", 2, "would both write to stdout"),
     (f"{RUN} --json --progress json", 2, "would both write to stdout; leave one out"),
+    (f"{RUN} --config s.toml", 2, "'PDAL' is not one of .. 'opals' (s.toml); see `",
+     {"s.toml": "[run]\nnames='PDAL'\n"}),
+    *((words, 2, "the name is empty; is a variable of the shell not set?") for words in (
+        "run '' -o out", "run strip.las -o ''", f"{RUN} --chain ''", f"{RUN} --polygon=", "stats ''",
+        "compare strip.las ''", "check ''")),
+    ("run strip.las -o out.laz", 2, "out.laz: this is a folder, which gets .. give a name such as out"),
     (f"{RUN} --jobs -1", 2, "--jobs"),
     (f"{RUN} --jobs 0.5", 2, "'0.5' is no whole number"),
     (f"{RUN} --jobs 100000", 2, "100000 is not in the range 0<=x<=1024"),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from wavebatch.batch.run import BatchResult, Outcome
     from wavebatch.core.echoes import COLUMNS, Column, EchoFlag, EchoTable
     from wavebatch.core.errors import ConfigError, InputError, StageError
-    from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
+    from wavebatch.core.waveforms import Digitizer, Noise, ReceiverNoise, ReturnTable, SystemPulse, WaveformBlock
     from wavebatch.files.cloud.cloud_reader import read_cloud
     from wavebatch.stages.chain import Chain, Range, Step, stage
     from wavebatch.surveying.inspect_strip import Strip, open_strip, survey
@@ -36,7 +36,7 @@ _MODULES = {
     "batch.run": ("BatchResult", "Outcome"),
     "core.echoes": ("COLUMNS", "Column", "EchoFlag", "EchoTable"),
     "core.errors": ("ConfigError", "InputError", "StageError"),
-    "core.waveforms": ("Digitizer", "Noise", "ReturnTable", "SystemPulse", "WaveformBlock"),
+    "core.waveforms": ("Digitizer", "Noise", "ReceiverNoise", "ReturnTable", "SystemPulse", "WaveformBlock"),
     "files.cloud.cloud_reader": ("read_cloud",),
     "stages.chain": ("Chain", "Range", "Step", "stage"),
     "batch.options": ("RunOptions",),
@@ -60,6 +60,7 @@ __all__ = [
     "Noise",
     "Outcome",
     "Range",
+    "ReceiverNoise",
     "ReturnTable",
     "RunOptions",
     "StageError",

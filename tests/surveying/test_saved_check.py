@@ -1,6 +1,7 @@
 """A saved survey of another sensor is refused by every command with --system; one of the same sensor never is."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -120,6 +121,13 @@ def test_a_forced_survey_is_a_warning_and_in_the_report(folder, tmp_path):
     result = succeed("run", folder / "noisy.las", "-o", tmp_path, "-q", "--system", folder / "SYSTEM.toml", "--force")
     assert "warning: --force: the survey given by --system is not of this sensor: its noise is" in result.stderr
     assert "--force: the survey" in (tmp_path / "noisy.report.json").read_text()
+
+
+def test_a_pulse_in_picoseconds_is_refused_though_it_finds_no_echo_to_compare(folder, tmp_path):
+    text = re.sub(r"(?m)^sigma_ref_ns = \S+", "sigma_ref_ns = 2000.0", (folder / "SYSTEM.toml").read_text())
+    (tmp_path / "ps.toml").write_text(text)
+    result = run("run", folder / "flat.las", "-o", tmp_path / "out", "--system", tmp_path / "ps.toml")
+    assert result.exit_code == 4 and "cannot show the pulse of --system, 2000 ns" in result.stderr, result.stderr
 
 
 @pytest.mark.parametrize("picoseconds", [2, 200_000], ids=["waveform within the pulse", "pulse on one sample"])

@@ -71,7 +71,7 @@ _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")
 
 
 def read_settings(command: click.Command, title: str, context: click.Context, arguments: list[str]) -> None:
-    """Take the command's tables of the settings files as defaults; click's errors for a wrong one.
+    """Take the command's tables of the settings files as defaults; click's errors for a wrong one, or an empty name.
 
     A file that the user names is the only one. Without it, that beside the inputs counts before that of the user.
     """
@@ -79,6 +79,10 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
         parsed, _, _ = command.make_parser(click.Context(command)).parse_args(list(arguments))
     except click.UsageError:
         return  # the real parsing says what is wrong
+    for one in command.params:
+        given = parsed.get(one.name) if isinstance(one.type, click.Path) or one.name in _INPUTS else None
+        if given == "" or isinstance(given, tuple | list) and "" in given:  # pathlib takes it for the current folder
+            raise click.BadParameter("the name is empty; is a variable of the shell not set?", context, one)
     options = _list_options(command)
     named = parsed.get("config") or options["config"].resolve_envvar_value(context)
     personal = Path(named or os.path.join(click.get_app_dir("wavebatch"), FILE))
@@ -135,6 +139,17 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
 
 def _list_options(command: click.Command) -> dict[str, click.Option]:
     return {one.name: one for one in command.params if isinstance(one, click.Option)}
+
+
+def _find_source(ctx: click.Context, option: click.Option | None) -> tuple[str, Any]:
+    """Settings file or variable that gives an option, and what it gives; empty and None for all other options."""
+    name = "" if option is None else option.name or ""
+    source = ctx.get_parameter_source(name)
+    if source is ParameterSource.DEFAULT_MAP:
+        return next((str(path), values[name]) for path, values in ctx.meta[READ].items() if name in values)
+    if option is not None and source is ParameterSource.ENVIRONMENT:
+        return next((variable, os.environ[variable]) for variable in option.envvar or () if os.environ.get(variable))
+    return "", None
 
 
 def _option_name(option: click.Option) -> str:
@@ -322,8 +337,14 @@ class ProgramCommand(click.Command):
         is_real = not ctx.resilient_parsing and {"-h", "--help"}.isdisjoint(args)
         if is_real:
             read_settings(self, self.title, ctx, args)
-        with click.core.augment_usage_errors(ctx):  # click names no command where a value is missing
-            rest = super().parse_args(ctx, args)
+        options = _list_options(self)
+        try:
+            with click.core.augment_usage_errors(ctx):  # click names no command where a value is missing
+                rest = super().parse_args(ctx, args)
+        except click.BadParameter as error:
+            if error.param is not None and (place := _find_source(ctx, options.get(error.param.name or ""))[0]):
+                error.message = f"{error.message.removesuffix('.')} ({place})"
+            raise
         for option in self.params:
             value = ctx.params.get(option.name or "")
             for number in value if isinstance(value, tuple) else (value,):
@@ -333,7 +354,6 @@ class ProgramCommand(click.Command):
             # Settings are put aside that exclude an option that counts more: of the command line, or of a variable.
             # Then those in force are printed in one line, kept for --dry-run, and variables without use named. With
             # --quiet those of a file are printed still: who types the command may not know of the file.
-            options = _list_options(ctx.command)
             for rivals in EXCLUSIVE:
                 given = {name: _ORDER.index(source) for name in rivals
                          if name in options and (source := ctx.get_parameter_source(name)) in _ORDER}  # fmt: skip
@@ -344,17 +364,12 @@ class ProgramCommand(click.Command):
                     ctx.set_parameter_source(name, ParameterSource.DEFAULT)
             lines, shown = [], []
             for name, option in options.items():
-                source = ctx.get_parameter_source(name)
-                if source is ParameterSource.DEFAULT_MAP:
-                    place, value = next((str(path), values[name]) for path, values in ctx.meta[READ].items()
-                                        if name in values)  # fmt: skip
-                elif source is ParameterSource.ENVIRONMENT:
-                    place = next(variable for variable in option.envvar if os.environ.get(variable))
-                    value = os.environ[place]
-                else:
+                place, value = _find_source(ctx, option)
+                if not place:
                     continue
+                is_file = ctx.get_parameter_source(name) is ParameterSource.DEFAULT_MAP
                 lines.append(f"--{_option_name(option)} {value} ({place})")
-                shown += lines[-1:] if source is ParameterSource.DEFAULT_MAP or not ctx.params.get("quiet") else []
+                shown += lines[-1:] if is_file or not ctx.params.get("quiet") else []
             ctx.meta["wavebatch.settings"] = tuple(lines)
             for line in _find_strangers(ctx):
                 talk(f"warning: {line}")

@@ -296,11 +296,14 @@ class WaveformBlock:
         Raises
         ------
         StageError
-            The samples are not unsigned integers, or not two-dimensional.
+            The samples are not unsigned integers, or not two-dimensional; the spacing is not positive.
         """
         samples = np.ascontiguousarray(samples)
         if samples.ndim != 2 or samples.dtype.kind != "u":
-            raise StageError(f"samples must be unsigned integers (n, s), got {samples.dtype} {samples.shape}")
+            raise StageError(f"samples must be unsigned integers (n, s), got {samples.dtype} {samples.shape}; shift "
+                             "and round them, e.g. np.rint(samples).astype(np.uint16)")  # fmt: skip
+        if not 0 < spacing < np.inf:
+            raise StageError(f"spacing must be above 0 ns, got {spacing!r}")
         n, s = samples.shape
         samples = samples.view()
         samples.flags.writeable = False

@@ -432,6 +432,8 @@ class Chain:
         self, block: WaveformBlock, system: SystemPulse, timing: dict[str, Seconds] | None = None
     ) -> tuple[WaveformBlock, Noise, SystemPulse]:
         """Return the block without the strip's defects, its noise, and the system of its digitizer."""
+        if not isinstance(system, SystemPulse):
+            raise TypeError(f"a chain runs with a block and a SystemPulse, such as survey.system, not {type(system)}")
         system = system.of(block)
         self.check(system)
         cleaned = clean_block(block, system)

@@ -244,6 +244,7 @@ class Strip(Closing):
     def __init__(self, reader: StripReader) -> None:
         self.reader = reader
         self._scan: StripScan | None = None
+        self._closed = False
 
     def __len__(self) -> int:
         """Return the number of waveforms."""
@@ -276,7 +277,11 @@ class Strip(Closing):
         ------
         InputError
             Where the strip cannot be processed: no packet can be read, vectors point nowhere, ...
+        ValueError
+            Where the strip is closed.
         """
+        if self._closed:
+            raise ValueError(f"{self.facts.path} is closed: use it inside its `with`, or open it again")
         if self._scan is None:
             self._scan = self.reader.scan()
         return self._scan
@@ -300,6 +305,7 @@ class Strip(Closing):
 
     def close(self) -> None:
         """Close the files and remove temporary ones. Harmless twice."""
+        self._closed = True
         if self._scan is not None:
             self._scan.close()
             self._scan = None

@@ -351,15 +351,15 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
     ------
     InputError
         If bits, spacing, noise or width of the strip contradict the survey; with `force`, only if the saved pulse is
-        too narrow or too wide for the strip's samples.
+        too narrow or too wide for the strip's samples (picoseconds in a file of nanoseconds find no echo to compare).
     """
-    if survey is not None and force:
+    if survey is not None:
         used = [digitizer for index, digitizer in reader.facts.digitizers.items() if index in scan.by_descriptor]
         sigma = survey.system.sigma_ref
         if used and not any(NARROWEST * one.spacing <= sigma <= WIDEST * one.n_samples * one.spacing for one in used):
             raise InputError(
                 f"{reader.facts.path}: its waveforms ({used[0].n_samples} samples {used[0].spacing:g} ns apart) cannot "
-                f"show the pulse of --system, {sigma:.3g} ns (Gaussian sigma); leave --system out to survey the strip"
+                f"show the pulse of --system, {sigma:g} ns (Gaussian sigma); leave --system out to survey the strip"
             )
     reason, sure = ("", False) if survey is None else find_contradiction(reader, scan, survey)
     if sure and not force:

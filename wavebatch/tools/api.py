@@ -161,6 +161,10 @@ def plan_run(
         For whatever is wrong with the options.
     """
     options.check()
+    folder = Path(options.output)
+    if folder.suffix.lower() in (".las", ".laz") and not folder.is_dir():
+        raise ConfigError(f"--output {folder}: this is a folder, which gets a cloud and a report for each strip; give "
+                          f"a name such as {folder.with_suffix('')}")  # fmt: skip
     asked_chain, request = find_request(options)
     air, attenuation = None, options.attenuation
     if options.visibility is not None:

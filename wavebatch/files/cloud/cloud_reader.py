@@ -328,7 +328,7 @@ def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.nda
     ----------
     path : path or str
         A cloud of `run`, or any other LAS or LAZ file.
-    columns : sequence of str, optional
+    columns : sequence of str or str, optional
         Names to read, in this order; all by default: x, y, z, the standard fields under laspy's names, extra bytes.
 
     Returns
@@ -352,7 +352,7 @@ def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.nda
     no-data value become float64, so that they can be NaN; all other integer columns (`echo_flags`, return numbers,
     classes) keep their type. `scan_angle` is in degrees.
     """
-    reader = _TableReader(Path(path), columns)
+    reader = _TableReader(Path(path), [columns] if isinstance(columns, str) else columns)
     with reader:
         table = np.empty(reader.point_count, reader.dtype)
         start = 0
