@@ -118,6 +118,9 @@ def test_recipe(folder, title):
         assert "Unit Type: ns" in shown and "STATISTICS_MEAN=" in shown
     if title == "qgis-process":
         assert re.search(r"MEAN:\s+[2-9]\.", shown), shown
+    if title == "csv":
+        table = (folder / "strip.csv").read_text()
+        assert table.startswith("x,y,z,classification") and ",,,," in table and "nan" not in table
     if title == "laspy":
         assert 2 < float(shown) < 20
     if title == "lidr":

@@ -19,7 +19,7 @@ from writer_tools import BACKENDS, data_file, read_raw, write_points
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader, ColumnReader, read_cloud
 from wavebatch.files.disk import raw_bytes
-from wavebatch.files.disk.raw_bytes import hiding_panics
+from wavebatch.files.disk.raw_bytes import hiding_failures
 from wavebatch.files.las import read_points
 from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype, read_header
 from wavebatch.files.las.read_points import open_points, read_checked_header
@@ -303,7 +303,7 @@ def test_a_panic_of_the_decoder_is_one_line_and_says_nothing_itself(tmp_path, mo
 
 def test_what_others_write_to_stderr_while_points_are_decoded_is_not_lost(capfd):
     files = len(os.listdir("/proc/self/fd"))
-    with pytest.raises(KeyError), hiding_panics():
+    with pytest.raises(KeyError), hiding_failures():
         os.write(2, b"from another thread\n")
         raise KeyError
     with ThreadPoolExecutor() as pool:
@@ -314,7 +314,7 @@ def test_what_others_write_to_stderr_while_points_are_decoded_is_not_lost(capfd)
 
 
 def _write_hidden():
-    with hiding_panics():
+    with hiding_failures():
         os.write(2, b"in a thread\n")
 
 
@@ -325,7 +325,7 @@ def test_an_interrupt_while_stderr_is_taken_gives_it_back(monkeypatch, capfd):
 
     raw_bytes_hold = raw_bytes._hold_stderr
     monkeypatch.setattr(raw_bytes, "_hold_stderr", interrupt)
-    with pytest.raises(KeyboardInterrupt), hiding_panics():
+    with pytest.raises(KeyboardInterrupt), hiding_failures():
         pass
     os.write(2, b"after\n")
     assert capfd.readouterr().err == "after\n"

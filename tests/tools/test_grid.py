@@ -1,7 +1,10 @@
 """`wavebatch grid`: every cell equals a plain count, in bounded memory; GDAL reads place, CRS, units and no-data."""
 
 import json
+import os
 import struct
+import subprocess
+import sys
 
 import laspy
 import numpy as np
@@ -191,6 +194,20 @@ def test_a_crs_that_no_geotiff_can_hold_is_refused(rng, tmp_path, monkeypatch):
     monkeypatch.setattr("wavebatch.files.geotiff_file._flatten", lambda crs: crs)
     result = _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif", code=2)
     assert "cannot hold the CRS" in result.stderr and "--crs EPSG:n" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX systems")
+def test_a_full_disk_is_one_line_without_those_of_gdal(rng, tmp_path):
+    _cloud(tmp_path / "a.las", rng)
+    code = (
+        "import resource, signal; from wavebatch.cli import main; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (3000,) * 2); main()"
+    )
+    arguments = [sys.executable, "-c", code, "grid", "a.las", "--column", "height", "--size", "0.5", "-o", "x.tif"]
+    done = subprocess.run(arguments, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("error: x.tif: cannot be written: ") and "previous exception" not in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError, advise_install
 from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.publish import Draft, check_target
-from wavebatch.files.disk.raw_bytes import Closing
+from wavebatch.files.disk.raw_bytes import Closing, hiding_failures
 from wavebatch.files.las.crs import read_wkt
 
 TILE = 256
@@ -120,10 +120,11 @@ def _writing(target: Path) -> Iterator[None]:
     import rasterio
 
     try:
-        with rasterio.Env(GDAL_PAM_ENABLED="NO"):
+        with hiding_failures(), rasterio.Env(GDAL_PAM_ENABLED="NO"):
             yield
     except (rasterio.errors.RasterioError, OSError) as error:
-        raise InputError(f"{target}: cannot be written: {error}; check disk and permissions") from error
+        reason = str(error.__cause__ or error).removesuffix(".")
+        raise InputError(f"{target}: cannot be written: {reason}; check disk and permissions") from error
 
 
 class RasterWriter(Closing):

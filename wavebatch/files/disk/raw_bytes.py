@@ -161,26 +161,26 @@ def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def hiding_panics() -> Iterator[None]:
-    """Keep what Rust writes to stderr, past Python, when lazrs panics: the error that follows says it in one line.
+def hiding_failures() -> Iterator[None]:
+    """Keep what Rust and GDAL write to stderr, past Python, when they fail: the error that follows says it in one line.
 
     What else comes there meanwhile is written at the end. In the main thread only: two threads would mix up the
     descriptors.
     """
     held: list[int] = []
-    panics = False
+    fails = False
     try:
         if threading.current_thread() is threading.main_thread():
             with interrupts.uninterrupted(), contextlib.suppress(OSError, AttributeError):
                 _hold_stderr(held)
         yield
     except BaseException as error:
-        panics = type(error).__name__ == "PanicException"
+        fails = type(error).__name__ in ("PanicException", "RasterioIOError")
         raise
     finally:
         if held:
             with interrupts.uninterrupted():
-                _release_stderr(*held, drop=panics)
+                _release_stderr(*held, drop=fails)
 
 
 def _hold_stderr(held: list[int]) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly, reading, undoing
+from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_failures, read_exactly, reading, undoing
 from wavebatch.files.las import header as las
 
 WAVEFORM_FORMATS = (4, 5, 9, 10)
@@ -172,7 +172,7 @@ class LazPoints:
     def read(self, start: int, stop: int) -> np.ndarray:
         rows = np.empty(stop - start, self._checked.dtype)
         done = 0
-        with guarded(self._checked.path, start, stop), hiding_panics():
+        with guarded(self._checked.path, start, stop), hiding_failures():
             while done < len(rows):
                 chunk = int(np.searchsorted(self._first, start + done, "right")) - 1
                 count = min(len(rows) - done, int(self._first[chunk + 1]) - start - done)
@@ -238,7 +238,7 @@ def _read_chunk_table(fd: int, checked: CheckedHeader, coding: _Coding) -> tuple
     version, count = _read_number(fd, table, "<u4"), _read_number(fd, table + 4, "<u4")
     if version != 0 or not 0 < count <= min(MAX_CHUNKS, table - start - 8):
         raise broken
-    with open(checked.path, "rb") as file, guarded(checked.path, 0, total), hiding_panics():
+    with open(checked.path, "rb") as file, guarded(checked.path, 0, total), hiding_failures():
         file.seek(table)
         chunks = np.array(lazrs.read_chunk_table_only(file, lazrs.LazVlr(coding.payload)), np.uint64)
     if len(chunks) != count or (chunks > np.uint64(max(MAX_CHUNK_BYTES, MAX_CHUNK_POINTS))).any():
