@@ -23,7 +23,7 @@ from click.shell_completion import BashComplete
 from commands import run_command
 
 import wavebatch as wb
-from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
+from wavebatch.batch.options import EXCLUSIVE, NEEDS, NO_CHANGE, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli import command as program
 from wavebatch.cli.command import GROUPS, ProgramCommand, complete_files, roff
@@ -74,7 +74,7 @@ def test_groups_name_options_that_exist_and_each_once():
     assert {tuple(name.rsplit(" ", 1)) for names in GROUPS.values() for name in names if " " in name} <= titled
     assert len(named) == len(set(named)) and not set(named) & set(OPTIONS)
     rivals = {name for group in (*EXCLUSIVE, *NEEDS.values(), NEEDS) for name in group}
-    assert [name for name in {*rivals, *program.NO_VARIABLE, *ELSEWHERE} if name not in known] == []
+    assert [name for name in {*rivals, *program.NO_VARIABLE, *NO_CHANGE} if name not in known] == []
     assert set(named) - known == set()
 
 

@@ -55,7 +55,7 @@ NEEDS = {
 MOST_JOBS = 1024
 """Most processes: more is a slip of the finger, and would stop the machine."""
 
-ELSEWHERE = ("output", "recursive", "jobs", "scheduler", "memory", "block_size", "overwrite", "resume")
+NO_CHANGE = ("output", "recursive", "jobs", "scheduler", "memory", "block_size", "overwrite", "resume")
 """Options that do not change a cloud."""
 
 
@@ -244,7 +244,7 @@ class RunOptions:
         """Return the command that makes the cloud of a strip again; files have their names without folders."""
         parts = ["wavebatch run", shlex.quote(strip), "-o DIR"]
         for name, value in self.given().items():
-            if name in ELSEWHERE:
+            if name in NO_CHANGE:
                 continue
             shipped = isinstance(value, str) and Path(value).name == value and not Path(value).suffix
             option = typed("profile" if name == "chain" and shipped else name)

@@ -23,11 +23,10 @@ from wavebatch.tools.sheets.sheet import list_lines
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
               help="Simulate this scene, e.g. mixed, open or forest; `wavebatch simulate --help` lists all; may be "
               "repeated.")
-@shared.options_of(command.BenchOptions, "waveforms", "pulses", "repeats")
+@shared.options_of(command.BenchOptions)
 @shared.seed_option("Seed of the simulated waveforms.")
 @shared.declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, "
                  "e.g. 0.02m.")
-@shared.options_of(command.BenchOptions, "all_methods")
 @shared.output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR",
                       required=False, folder=True)
 @shared.html_option

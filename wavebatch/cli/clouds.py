@@ -168,14 +168,13 @@ FEW_CELLS = 1_000_000
 @shared.declared("recursive")
 @click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
-@shared.options_of(GridOptions, "statistic", "size")
+@shared.options_of(GridOptions)
 @click.option("--forest", is_flag=True, help="Metrics of voxels that voxelize --forest made, in place of columns: "
               "cover, heights of light, leaf area index and density, with errors.")
 @shared.options_of(ForestOptions)
 @shared.output_option("Raster to write: .tif.", "X.tif")
 @shared.bbox_option("Write")
 @shared.selection_options
-@shared.options_of(GridOptions, "crs", "no_data")
 @shared.common_options("overwrite", "json")
 def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Write columns of CLOUDs as a GeoTIFF, of clouds of any size.

@@ -164,14 +164,12 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
 @shared.strips_argument
 @shared.output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each; or a folder, which "
                       "gets STEM.npz for each strip, with --forest STEM.laz.", "FILE|DIR", folder=None)
-@shared.options_of(VoxelOptions, "size")
+@shared.options_of(VoxelOptions)
 @shared.options_of(Deconvolution)
-@shared.options_of(VoxelOptions, "headroom", "ground_height", "reflectance_ratio")
 @shared.where_option("Use only pulses with a return (a point of the strip)")
 @click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
               help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
               "time.")
-@shared.options_of(VoxelOptions, "all_crossed", "forest")
 @shared.system_option
 @shared.declared("calibration")
 @shared.declared("energy")

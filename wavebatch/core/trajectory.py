@@ -98,7 +98,7 @@ class Trajectory:
         """
         first = max(int(np.searchsorted(self.time, start, side="right")) - 1, 0)
         last = min(int(np.searchsorted(self.time, stop)) + 1, len(self.time))
-        first = max(min(first, last - 2), 0)
+        first = max(min(first, last - 2), 0)  # two positions at least, also beyond an end of the trajectory
         usual = float(np.median(np.diff(self.time[first:last]))) if last - first > 1 else step
         every = max(1, int(step / usual))
         rows = np.unique(np.r_[np.arange(first, max(last, first + 2), every), max(last, first + 2) - 1])

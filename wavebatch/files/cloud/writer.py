@@ -79,11 +79,11 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
             raise ConfigError(f"{path}: --las-version 1.3 {clash} {target}: its last format is 5; {what}")
         if any(evlr.record_id != las.WAVEFORM_RECORD_ID for evlr in evlrs):
             raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
-        if _tell_crs(header.vlrs) == (True, False):
+        if _has_crs(header.vlrs) == (True, False):
             raise InputError(f"{path}: its CRS is given as WKT, which LAS 1.3 does not have; leave --las-version out")
         return Version((1, 3), target, repaired, notes)
     records: list[Any] = [*header.vlrs, *evlrs]
-    only_keys = _tell_crs(records) == (False, True)
+    only_keys = _has_crs(records) == (False, True)
     if wanted == "1.4" and point_format is None and not keep:
         modern = las.MODERN.get(target, target)
         wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
@@ -110,7 +110,7 @@ _REPAIRED = (
 )
 
 
-def _tell_crs(records: Sequence[Any]) -> tuple[bool, bool]:
+def _has_crs(records: Sequence[Any]) -> tuple[bool, bool]:
     """Whether records, extended or not, have the CRS as WKT, and as GeoTIFF keys."""
     has = (las.has_record(records, las.PROJECTION, number) for number in (las.WKT_ID, las.GEOTIFF_ID))
     return next(has), next(has)
@@ -396,9 +396,10 @@ class CloudWriter(PointFile):
         encoding = source.global_encoding & ~(las.WAVES_INTERNAL | las.WAVES_EXTERNAL)
         if layout.packets is not None:
             encoding |= las.WAVES_INTERNAL if layout.packets.internal else las.WAVES_EXTERNAL
-        has_wkt, has_keys = _tell_crs([*vlrs, *self._evlrs])[0], _tell_crs(vlrs)[1]
+        has_wkt, has_keys = _has_crs([*vlrs, *self._evlrs])[0], _has_crs(vlrs)[1]
         if layout.version < (1, 4):
             encoding &= ~las.WKT_BIT  # a reserved bit there
+        # Where a file has both, formats 6 to 10 mean the WKT, older ones the keys; without either, the former say WKT.
         elif not has_keys and (has_wkt or layout.point_format >= 6) or has_wkt and layout.point_format >= 6:
             encoding |= las.WKT_BIT
         # `PointFile` sets what follows from the points: their number, length, bounds, times and compression.
