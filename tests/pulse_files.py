@@ -102,7 +102,8 @@ class PulseFile:
         return path
 
     def _encode(self, samplings: Sequence[Sampling]) -> bytes:
-        front = struct.pack("<IIiHHfII", 92, 0, 0, self.extra, len(samplings), self.unit, 0, 0).ljust(92, b"\0")
+        size = 92 if all(sampling.size for sampling in samplings) else 0  # as its samplings, shorter than its fields
+        front = struct.pack("<IIiHHfII", size, 0, 0, self.extra, len(samplings), self.unit, 0, 0).ljust(size, b"\0")
         return front + b"".join(sampling.encode() for sampling in samplings)
 
     def _encode_waves(self, pulse: Pulse) -> bytes:

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import laspy
 import numpy as np
 import pytest
-from commands import run_command
+from commands import refuses, run_command
 
 import wavebatch as wb
 from wavebatch.core.echoes import COLUMNS
@@ -173,8 +173,7 @@ def test_echoes_become_a_frame(strips, monkeypatch):
         assert tuple(frame.columns) == echoes.to_numpy().dtype.names and len(frame) == len(echoes)
         np.testing.assert_array_equal(frame["amplitude"], echoes.amplitude)
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(wb.StageError, match="a DataFrame needs pandas: .*pip.* install .*pandas.*; or use to_numpy"):
-        echoes.to_frame()
+    refuses(wb.StageError, "a DataFrame needs pandas: .*pip.* install .*pandas.*; or use to_numpy", echoes.to_frame)
 
 
 def test_survey_takes_a_path_and_says_what_the_command_says(strips):
@@ -198,14 +197,11 @@ def test_waveforms_of_arrays_are_surveyed_and_decomposed(rng):
     echoes = wb.auto_chain(survey).run(block, survey.system)
     assert np.array_equal(echoes.waveform, np.arange(2000))
     assert np.abs(echoes.time - centre).max() < 0.5
-    with pytest.raises(wb.ConfigError, match="needs the points of a strip"):
-        wb.survey([block], divergence=0.5)
+    refuses(wb.ConfigError, "needs the points of a strip", wb.survey, [block], divergence=0.5)
     for nothing in ([], [block.rows(slice(0))]):
-        with pytest.raises(wb.InputError, match="hold no waveform"):
-            wb.survey(nothing)
+        refuses(wb.InputError, "hold no waveform", wb.survey, nothing)
     for other in (block.samples, [block.samples], None):
-        with pytest.raises(wb.ConfigError, match="give a strip, its path, or blocks of waveforms"):
-            wb.survey(other)
+        refuses(wb.ConfigError, "give a strip, its path, or blocks of waveforms", wb.survey, other)
 
 
 def test_a_strip_without_waveforms_cannot_be_surveyed(strips, tmp_path, edit_points):
@@ -214,8 +210,7 @@ def test_a_strip_without_waveforms_cannot_be_surveyed(strips, tmp_path, edit_poi
         return points
 
     bare = edit_points(strips[0], tmp_path / "bare.las", strip_off)
-    with pytest.raises(wb.InputError, match="holds no waveform"):
-        wb.survey(bare)
+    refuses(wb.InputError, "holds no waveform", wb.survey, bare)
 
 
 # Chains
@@ -229,10 +224,8 @@ def test_chains_come_by_name_or_path(tmp_path):
     path.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
     assert [step.stage.name for step in wb.load_chain(path).steps][2] == "decompose.none"
     assert len(wb.load_chain(str(path)).steps) == 3
-    with pytest.raises(wb.ConfigError, match="profile 'acurate' does not exist; did you mean 'accurate'"):
-        wb.load_chain("acurate")
-    with pytest.raises(wb.ConfigError, match="none.toml: chain file cannot be read"):
-        wb.load_chain("none.toml")
+    refuses(wb.ConfigError, "profile 'acurate' does not exist; did you mean 'accurate'", wb.load_chain, "acurate")
+    refuses(wb.ConfigError, "none.toml: chain file cannot be read", wb.load_chain, "none.toml")
 
 
 # A run
@@ -281,8 +274,7 @@ def test_a_strip_that_fails_is_in_the_result(strips, tmp_path):
     result = wb.run([bad, strips[0]], tmp_path / "out", chain="fast")
     assert result.failed == 1
     assert isinstance(result.outcomes[0].error, wb.InputError) and result.outcomes[1].status == "written"
-    with pytest.raises(wb.InputError, match=r"bad.las: .* \(1 of 2 strips have no cloud\)$"):
-        result.raise_for_failures()
+    refuses(wb.InputError, r"bad.las: .* \(1 of 2 strips have no cloud\)$", result.raise_for_failures)
     wb.run(strips[0], tmp_path / "good", chain="fast").raise_for_failures()
 
 
@@ -312,8 +304,7 @@ def test_wrong_options_start_nothing(strips, tmp_path, options, words):
     if words is None:
         assert wb.run(strips[0], tmp_path / "out", **options).failed == 0
         return
-    with pytest.raises(wb.ConfigError, match=words):
-        wb.run(strips[0], tmp_path / "out", **options)
+    refuses(wb.ConfigError, words, wb.run, strips[0], tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
@@ -339,8 +330,7 @@ def test_wrong_use_is_said_in_the_words_of_the_user(strips, tmp_path):
 
 
 def test_an_option_that_does_not_exist_is_a_type_error(strips, tmp_path):
-    with pytest.raises(TypeError, match="has no option job; did you mean 'jobs'"):
-        wb.run(strips[0], tmp_path, job=4)
+    refuses(TypeError, "has no option job; did you mean 'jobs'", wb.run, strips[0], tmp_path, job=4)
 
 
 # A cloud
@@ -375,8 +365,7 @@ def test_read_cloud_reads_only_what_is_asked_for(clouds):
     )
     with pytest.raises(wb.ConfigError, match="has no column 'echo_wdth'; did you mean 'echo_width'"):
         wb.read_cloud(clouds[0] / "urban.laz", ["echo_wdth"])
-    with pytest.raises(wb.InputError, match="nothing.laz"):
-        wb.read_cloud(clouds[0] / "nothing.laz")
+    refuses(wb.InputError, "nothing.laz", wb.read_cloud, clouds[0] / "nothing.laz")
 
 
 # Real data

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batch_tools import make_job, run_one
-from commands import run_command, succeed
+from commands import fail, refuses, run_command, succeed
 from strips import cut_strip
 from writer_tools import data_file
 
 import wavebatch
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.report_file import LEAST_JUDGED, find_remarks, find_warnings
+from wavebatch.batch.report_file import LEAST_JUDGED, MOST_FAILED, find_remarks, find_warnings
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import WARNINGS, StripWarning
 from wavebatch.files.las.header import read_header
@@ -184,13 +184,17 @@ def prepared(tiny_strip):
     return found
 
 
-@pytest.mark.parametrize("number", [LEAST_JUDGED - 1, LEAST_JUDGED])
-def test_few_waveforms_are_not_judged(prepared, number):
+@pytest.mark.parametrize(
+    ("number", "share", "judged"),
+    [(LEAST_JUDGED - 1, 1.0, False), (LEAST_JUDGED, 1.0, True), (LEAST_JUDGED, MOST_FAILED, False)],
+)
+def test_few_waveforms_and_usual_shares_of_failed_fits_are_not_judged(prepared, number, share, judged):
     seen = dict.fromkeys(("points_in", "waveforms", "points_out"), number)
-    failed = RunReport(counts={**seen, "echoes": number}, flags={"AT_BOUND": number})
-    for report, code in ((failed, "failed-fits"), (RunReport(counts=seen), "empty")):
+    failed = RunReport(counts={**seen, "echoes": number}, flags={"AT_BOUND": int(share * number)})
+    enough = number >= LEAST_JUDGED
+    for report, code, expected in ((failed, "failed-fits", judged), (RunReport(counts=seen), "empty", enough)):
         codes = [one.code for one in find_warnings(prepared, report, (), {})]
-        assert codes == [code] * (number == LEAST_JUDGED)
+        assert codes == [code] * expected
 
 
 @pytest.mark.parametrize(
@@ -212,8 +216,7 @@ def test_every_warning_has_a_listed_code():
     page = (package.parent / "docs" / "json.md").read_text()
     listed = dict(re.findall(r"(?m)^\| `([a-z-]+)` \| ([^|]+) \|$", page.split("### Codes of warnings")[1]))
     assert used == set(WARNINGS) and {code: listed[code] for code in WARNINGS} == WARNINGS
-    with pytest.raises(ValueError, match="no code"):
-        StripWarning("nonsense", "")
+    refuses(ValueError, "no code", StripWarning, "nonsense", "")
 
 
 @pytest.fixture
@@ -244,8 +247,7 @@ def test_summary_and_page_have_the_warnings_of_every_strip(many, tmp_path):
     assert {*rows[:doubted]} == {name for name, warnings in found.items() if warnings}
     for one in found["d"]:
         assert one["code"] in text and one["text"][:30] in text
-    wrong = run_command(*task, "--resume", "--fail-on", "emtpy")
-    assert wrong.exit_code == 2 and "did you mean 'empty'?" in wrong.stderr
+    fail(2, "did you mean 'empty'?", *task, "--resume", "--fail-on", "emtpy")
 
 
 def test_survey_prints_the_doubts_of_a_run(many):

@@ -8,7 +8,7 @@ import struct
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command
+from commands import refuses, run_command
 from writer_tools import data_file
 
 from wavebatch.batch.counts import AMPLITUDE_BINS, COUNTS, OVERFLOW, WIDTH_BINS, RunReport, count_flags
@@ -125,8 +125,7 @@ def test_a_right_report_passes():
 def test_any_count_that_is_off_by_one_is_noticed(name):
     part_of = {"points_cut": "points_broken"}.get(name, name)
     wrong = _report(**{name: _report().count(part_of) + 1})
-    with pytest.raises(StageError, match=r"strip\.las: .* add up to"):
-        wrong.check("echoes", "strip.las")
+    refuses(StageError, r"strip\.las: .* add up to", wrong.check, "echoes", "strip.las")
 
 
 def test_reports_merge_in_any_order():

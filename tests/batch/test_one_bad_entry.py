@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from batch_tools import make_job, run_one
-from commands import run_command
+from commands import refuses, run_command
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
@@ -216,8 +216,7 @@ def test_the_claim_of_a_killed_run_counts_no_more(tmp_path):
     subprocess.run([sys.executable, "-c", code, tmp_path])
     assert len(list(tmp_path.iterdir())) == 1
     claim = publish.Claim(tmp_path, "a")
-    with pytest.raises(InputError, match="another run makes this output now"):
-        publish.Claim(tmp_path, "a")
+    refuses(InputError, "another run makes this output now", publish.Claim, tmp_path, "a")
     assert publish.remove_stale(tmp_path) == []
     claim.discard()
     assert not list(tmp_path.iterdir())

@@ -6,7 +6,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
-from commands import run_command
+from commands import refuses, run_command
 
 import wavebatch as wb
 from wavebatch.batch.options import OPTIONS, RunOptions
@@ -390,17 +390,14 @@ def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):
             (block, index, prepared.job.chain.run(block, prepared.system))
             for block, index in reader.read_blocks(unit, 100, owned_only=True)
         ]
-    with pytest.raises(StageError, match="exactly once"):
-        gather_echoes(unit, results[1:])
-    with pytest.raises(StageError, match="exactly once"):
-        gather_echoes(unit, [*results, results[0]])
+    refuses(StageError, "exactly once", gather_echoes, unit, results[1:])
+    refuses(StageError, "exactly once", gather_echoes, unit, [*results, results[0]])
     echoes = gather_echoes(unit, results)
     doubled = echoes.table.attributes["point"].copy()
     matched = np.flatnonzero(doubled >= 0)
     doubled[matched[1]] = doubled[matched[0]]
     wrong = dataclasses.replace(echoes, table=echoes.table.with_attributes(point=doubled))
-    with pytest.raises(StageError, match="one to one"):
-        assemble_returns(unit, wrong, prepared.layout)
+    refuses(StageError, "one to one", assemble_returns, unit, wrong, prepared.layout)
     prepared.scan.close()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
+from commands import refuses
 from writer_tools import read_provenance
 
 from wavebatch.batch.job import choose_columns
@@ -208,8 +209,7 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
             task.submit(workers)
             task.take()
     strip.write_bytes(strip.read_bytes() + b"more")
-    with pytest.raises(InputError, match="changed while it was read"):
-        task.finish()
+    refuses(InputError, "changed while it was read", task.finish)
     task.drop()
     assert _files(tmp_path) == ["tiny.las"]
 
@@ -221,8 +221,7 @@ def test_memory_decides_jobs_and_blocks():
     assert jobs == 2 and block_size is not None
     assert plan_memory(1, LEAST_MEMORY)[0] == 1
     assert plan_memory(8, LEAST_MEMORY)[0] == 1
-    with pytest.raises(ConfigError, match="too little"):
-        plan_memory(1, LEAST_MEMORY - 1)
+    refuses(ConfigError, "too little", plan_memory, 1, LEAST_MEMORY - 1)
 
 
 def test_columns_are_chosen_and_added():
@@ -232,20 +231,16 @@ def test_columns_are_chosen_and_added():
     assert choose_columns(chain, "+echo_time") == (*usual, "echo_time")
     assert choose_columns(chain, "echo_width, amplitude") == ("echo_width", "amplitude")
     assert choose_columns(chain, "echo_width,+echo_time") == ("echo_width", "echo_time")
-    with pytest.raises(ConfigError, match="did you mean 'amplitude'"):
-        choose_columns(chain, "amplitud")
-    with pytest.raises(ConfigError, match=r"write \+amplitude to add it too"):
-        choose_columns(chain, "+echo_time,amplitude")
-    with pytest.raises(ConfigError, match=r"does not compute 'energy'; add stage attribute\.energy"):
-        choose_columns(chain, "+energy")
+    refuses(ConfigError, "did you mean 'amplitude'", choose_columns, chain, "amplitud")
+    refuses(ConfigError, r"write \+amplitude to add it too", choose_columns, chain, "+echo_time,amplitude")
+    refuses(ConfigError, r"does not compute 'energy'; add stage attribute\.energy", choose_columns, chain, "+energy")
 
 
 def test_a_chain_without_positions_is_refused():
     import dataclasses
 
     chain = make_job("x.las").chain
-    with pytest.raises(ConfigError, match=r"attribute\.position"):
-        choose_columns(dataclasses.replace(chain, steps=chain.steps[:3]))
+    refuses(ConfigError, r"attribute\.position", choose_columns, dataclasses.replace(chain, steps=chain.steps[:3]))
 
 
 def test_a_prepared_strip_travels_between_processes(tiny_strip):

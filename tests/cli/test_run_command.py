@@ -8,7 +8,7 @@ import sys
 
 import pytest
 from batch_tools import read_cloud
-from commands import run_command
+from commands import fail, run_command
 from commands import run_command as run
 
 from wavebatch.cli import COMMANDS
@@ -244,8 +244,7 @@ def test_one_file_for_several_strips_and_two_of_one_name_are_refused(folder, tmp
     result = run(command, folder, "--recursive", "-o", tmp_path / name, *options)
     assert result.exit_code == 2 and f"{name}: one file for 2 strips; give a folder" in result.stderr
     (folder / "sub" / "b.Las").rename(folder / "sub" / "A.las")
-    result = run(command, folder, "--recursive", "-o", tmp_path / "out", *options)
-    assert result.exit_code == 2 and "two strips have the same name" in result.stderr
+    fail(2, "two strips have the same name", command, folder, "--recursive", "-o", tmp_path / "out", *options)
 
 
 @pytest.mark.parametrize("command", ["info", "voxelize", "slice"])

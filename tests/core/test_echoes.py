@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.cli.messages import format_json
 from wavebatch.core.echoes import (
@@ -68,13 +69,11 @@ def test_concatenate_with_and_without_shifts():
     assert joined.attributes["x"].tolist() == [1.0, 2.0, 3.0]
     assert EchoTable.concatenate([first, second]).waveform.tolist() == [0, 1, 0]
     assert len(EchoTable.concatenate([])) == 0
-    with pytest.raises(StageError, match="different columns"):
-        EchoTable.concatenate([first, make_table([0])])
+    refuses(StageError, "different columns", EchoTable.concatenate, [first, make_table([0])])
 
 
 def test_attributes_must_fit_the_table():
-    with pytest.raises(StageError, match="column x has 2 values for 1 echoes"):
-        make_table([0]).with_attributes(x=np.zeros(2))
+    refuses(StageError, "column x has 2 values for 1 echoes", make_table([0]).with_attributes, x=np.zeros(2))
 
 
 def test_flags_are_single_bits_with_a_meaning():

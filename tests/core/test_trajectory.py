@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import ADJUSTED, WEEK, Trajectory, apply_lever_arm, solve_offset
@@ -42,10 +43,8 @@ def test_nothing_is_said_outside_and_in_gaps():
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_too_few_positions(number):
-    with pytest.raises(InputError, match="at least two are needed"):
-        Trajectory.build(np.arange(number), np.zeros((number, 3)))
-    with pytest.raises(InputError, match="at least two are needed"):
-        Trajectory.build(np.array([1.0, np.nan]), np.zeros((2, 3)))
+    refuses(InputError, "at least two are needed", Trajectory.build, np.arange(number), np.zeros((number, 3)))
+    refuses(InputError, "at least two are needed", Trajectory.build, np.array([1.0, np.nan]), np.zeros((2, 3)))
 
 
 ADJUSTED_START = 300_000_000.0
@@ -73,8 +72,7 @@ def test_the_clock_is_solved_from_the_data(own, strip, clocks):
 
 def test_a_trajectory_of_another_day_is_refused():
     path = Trajectory.build(*flight())
-    with pytest.raises(InputError, match="do not overlap on any clock"):
-        solve_offset(path, 300_086_400.0, 300_086_500.0)
+    refuses(InputError, "do not overlap on any clock", solve_offset, path, 300_086_400.0, 300_086_500.0)
 
 
 def test_lever_arm():
@@ -137,18 +135,15 @@ def write_sbet(path, latitude=48.0, number=400):
 
 def test_sbet_without_pyproj_or_crs_is_refused(tmp_path, monkeypatch):
     path = write_sbet(tmp_path / "s.sbet")
-    with pytest.raises(InputError, match="but the strip has no CRS"):
-        read_trajectory(path)
+    refuses(InputError, "but the strip has no CRS", read_trajectory, path)
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
-    with pytest.raises(InputError, match=r"pip install 'pyproj>=3.6'"):
-        read_trajectory(path, crs="EPSG:32632")
+    refuses(InputError, r"pip install 'pyproj>=3.6'", read_trajectory, path, crs="EPSG:32632")
 
 
 def test_bytes_that_are_no_sbet(tmp_path):
     path = tmp_path / "s.out"
     np.random.default_rng(1).normal(0, 1e6, 17 * 50).astype("<f8").tofile(path)
-    with pytest.raises(InputError, match="not an SBET"):
-        read_trajectory(path, crs="EPSG:32632")
+    refuses(InputError, "not an SBET", read_trajectory, path, crs="EPSG:32632")
 
 
 @pytest.mark.parametrize(("heading", "wander"), [(np.inf, np.inf), (1e308, -1e308), (np.nan, 0.0)])
@@ -167,10 +162,8 @@ def test_sbet_is_projected(tmp_path):
     # UTM zone 32: 11 E, 48 N by Snyder's series.
     assert found.xyz[0] == pytest.approx([649_168.5, 5_318_366.0, 1500.0], abs=200.0)
     assert found.velocity[200, 1] == pytest.approx(127.0, abs=2.0)
-    with pytest.raises(InputError, match="needs metres"):
-        read_trajectory(tmp_path / "s.sbet", crs="EPSG:4326")
-    with pytest.raises(InputError, match="CRS of the strip is not understood"):
-        read_trajectory(tmp_path / "s.sbet", crs="nonsense")
+    refuses(InputError, "needs metres", read_trajectory, tmp_path / "s.sbet", crs="EPSG:4326")
+    refuses(InputError, "CRS of the strip is not understood", read_trajectory, tmp_path / "s.sbet", crs="nonsense")
 
 
 def test_positions_beyond_all_places_are_dropped():

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command, succeed
+from commands import fail, refuses, run_command, succeed
 from hypothesis import given
 from hypothesis import strategies as st
 from strips import add_record, descriptor, make_raw, vlr
@@ -287,8 +287,7 @@ def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
     raw.vlrs = [descriptor(1), *records]
     bounds = 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3
     arguments = _move(raw, tmp_path, 155, (4_194e3, 1_162e3, 4_647e3), bounds)
-    done = run_command(*arguments, "--flight-height", "500")
-    assert done.exit_code == 4 and "coordinates are geocentric" in done.stderr
+    fail(4, "coordinates are geocentric", *arguments, "--flight-height", "500")
     assert run_command(*arguments).exit_code == 0
 
 
@@ -304,8 +303,7 @@ def _move(raw, folder, at, numbers, bounds):
 
 def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
     arguments = _move(make_raw(200), tmp_path, 131, (1e-7, 1e-7, 0.001), (15.7, 15.6, 48.7, 48.6, 400.0, 300.0))
-    done = run_command(*arguments)
-    assert done.exit_code == 4 and "coordinates are degrees, packet vectors metres" in done.stderr
+    fail(4, "coordinates are degrees, packet vectors metres", *arguments)
     assert run_command(*arguments, "--points", "returns").exit_code == 0
 
 
@@ -635,8 +633,7 @@ def test_small_coordinates_inside_of_a_strip_are_those_of_the_strip(placed_strip
     if has_crs:
         assert np.abs(place_rings(alone, boxes[1:], path, _local(path))[0]).max() > 1e6
     else:
-        with pytest.raises(InputError, match="is in degrees"):
-            place_rings(alone, boxes[1:], path, _local(path))
+        refuses(InputError, "is in degrees", place_rings, alone, boxes[1:], path, _local(path))
 
 
 def test_one_point_at_the_origin_does_not_make_degrees_coordinates_of_the_strip(placed_strip):
@@ -659,8 +656,7 @@ def test_what_cannot_be_placed_is_one_line(placed_strip, plain, tmp_path, monkey
     monkeypatch.setitem(sys.modules, "pyproj", None)
     with pytest.raises(ConfigError, match=r"a.geojson: is in OGC:CRS84, .*needs pyproj: .*pip install .*; or write"):
         polygon.place(placed_strip, read_header(placed_strip))
-    with pytest.raises(ConfigError, match="its member crs has no name"):
-        read_area_file("c.geojson", {"type": "link"}, [])
+    refuses(ConfigError, "its member crs has no name", read_area_file, "c.geojson", {"type": "link"}, [])
 
 
 def test_without_pyproj_only_the_strips_own_code_is_taken(placed_strip, tmp_path, monkeypatch):
@@ -784,8 +780,7 @@ def test_longitude_and_latitude():
         # 10 m east at this latitude
         assert (other - x) * np.cos(np.radians(y)) * 111320 == pytest.approx(10, rel=0.01)
         assert crs.member is None
-    with pytest.raises(InputError, match="a.las: its CRS is not understood"):
-        plan_crs("a.las", "PROJCS[nothing]", "wgs84")
+    refuses(InputError, "a.las: its CRS is not understood", plan_crs, "a.las", "PROJCS[nothing]", "wgs84")
 
 
 def test_riegls_metres_in_the_geographic_crs_are_degrees():
@@ -815,14 +810,12 @@ def test_the_strips_crs_is_named(crs, name):
 
 
 def test_what_cannot_be_placed_is_said(monkeypatch):
-    with pytest.raises(InputError, match="a.las: has no CRS, .* write .csv, or --geojson-crs keep"):
-        plan_crs("a.las", None, "wgs84")
+    refuses(InputError, "a.las: has no CRS, .* write .csv, or --geojson-crs keep", plan_crs, "a.las", None, "wgs84")
     assert plan_crs("a.las", None, "keep").member is None
     monkeypatch.setitem(sys.modules, "pyproj", None)
     with pytest.raises(ConfigError, match="needs pyproj: .*pip install .pyproj>=3.6.; or write .csv"):
         plan_crs("a.las", "EPSG:32632", "wgs84")
-    with pytest.raises(ConfigError, match="must be one of wgs84, keep"):
-        plan_crs("a.las", None, "epsg")
+    refuses(ConfigError, "must be one of wgs84, keep", plan_crs, "a.las", None, "epsg")
 
 
 @pytest.mark.parametrize("mode", ["wgs84", "keep"])

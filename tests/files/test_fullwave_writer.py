@@ -5,6 +5,7 @@ import os
 import laspy
 import numpy as np
 import pytest
+from commands import refuses
 from writer_tools import BACKENDS, random_points, read_raw, write_strip
 
 from wavebatch.core.errors import ConfigError, InputError
@@ -144,8 +145,7 @@ def test_samples_that_do_not_fit_are_refused(tmp_path, samples):
 )
 def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path, options, message):
     options = {"point_format": 9, "internal": True, "digitizers": ONE, **options}
-    with pytest.raises(ConfigError, match=message):
-        FullwaveWriter(tmp_path / "a.las", **options)
+    refuses(ConfigError, message, FullwaveWriter, tmp_path / "a.las", **options)
     with pytest.raises(ConfigError, match="must end in .las or .laz"):
         FullwaveWriter(tmp_path / "a.xyz", point_format=9, internal=True, digitizers=ONE)
     assert os.listdir(tmp_path) == []
@@ -154,8 +154,7 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path, options,
 @pytest.mark.parametrize("existing", ["a.las", "a.wdp"])
 def test_nothing_is_replaced_unless_asked(tmp_path, existing):
     (tmp_path / existing).write_bytes(b"old")
-    with pytest.raises(InputError, match=f"{existing}: exists already"):
-        write_strip(tmp_path / "a.las", internal=False)
+    refuses(InputError, f"{existing}: exists already", write_strip, tmp_path / "a.las", internal=False)
     assert os.listdir(tmp_path) == [existing] and (tmp_path / existing).read_bytes() == b"old"
     points = write_strip(tmp_path / "a.las", internal=False, overwrite=True)
     assert read_raw(tmp_path / "a.las").tobytes() == points.tobytes()
@@ -164,6 +163,5 @@ def test_nothing_is_replaced_unless_asked(tmp_path, existing):
 def test_a_strip_that_appears_meanwhile_is_kept(tmp_path):
     with FullwaveWriter(tmp_path / "a.las", point_format=9, internal=False, digitizers=ONE) as writer:
         (tmp_path / "a.las").write_bytes(b"other")
-        with pytest.raises(InputError, match="a.las: exists already"):
-            writer.commit()
+        refuses(InputError, "a.las: exists already", writer.commit)
     assert os.listdir(tmp_path) == ["a.las"] and (tmp_path / "a.las").read_bytes() == b"other"

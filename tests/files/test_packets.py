@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import refuses, run_command
 from hypothesis import given
 from hypothesis import strategies as st
 from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_head, vlr
@@ -392,8 +392,7 @@ def test_witnesses_that_contradict_each_other_are_refused_unless_overridden(tmp_
     turn_z = raw.points["z_t"]
     turn_z *= -1
     path = raw.write(tmp_path / "a.las")
-    with pytest.raises(InputError, match=r"a\.las: packet vectors contradict each other: .*pass --direction"):
-        scan_of(path)
+    refuses(InputError, r"a\.las: packet vectors contradict each other: .*pass --direction", scan_of, path)
     scan = scan_of(path, direction="toward")
     assert (scan.vectors.direction, scan.problems) == ("toward", ())
     assert "--direction toward overrides" in scan.warnings[0]
@@ -411,8 +410,7 @@ def test_vectors_that_say_nothing_are_refused_unless_overridden(tmp_path):
     raw = make_raw(most_returns=1)
     raw.points["z_t"][::2] *= -1
     path = raw.write(tmp_path / "a.las")
-    with pytest.raises(InputError, match="is not clear.*--direction toward or away"):
-        scan_of(path)
+    refuses(InputError, "is not clear.*--direction toward or away", scan_of, path)
     assert scan_of(path, direction="away").vectors.direction == "away"
 
 
@@ -425,8 +423,7 @@ def test_a_given_direction_that_the_file_denies_is_used_and_said(tmp_path):
 
 
 def test_an_unknown_direction_is_a_config_error(tmp_path):
-    with pytest.raises(ConfigError, match="'up'.*auto, toward, away"):
-        StripReader(make_raw().write(tmp_path / "a.las"), direction="up")
+    refuses(ConfigError, "'up'.*auto, toward, away", StripReader, make_raw().write(tmp_path / "a.las"), direction="up")
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.965, 1.1, 30.0])

@@ -4,6 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.point_filter import EVERY, REASONS, PointFilter
@@ -91,8 +92,7 @@ def test_columns_that_are_missing_are_named():
     ],
 )
 def test_wrong_options_are_refused(options, words):
-    with pytest.raises(ConfigError, match=words):
-        PointFilter.build(**options)
+    refuses(ConfigError, words, PointFilter.build, **options)
 
 
 def test_a_filter_travels_between_processes():

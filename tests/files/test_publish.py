@@ -10,7 +10,7 @@ import sys
 import click
 import numpy as np
 import pytest
-from commands import run_command
+from commands import refuses, run_command
 
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
@@ -48,11 +48,9 @@ def test_an_existing_file_is_kept_without_overwrite(tmp_path):
     target = tmp_path / "a"
     draft = write(target, b"new")
     target.write_bytes(b"old")  # appears while we write
-    with pytest.raises(InputError, match=r"a: exists already; .*--overwrite"):
-        publish_together([draft])
+    refuses(InputError, r"a: exists already; .*--overwrite", publish_together, [draft])
     assert names(tmp_path) == ["a"] and target.read_bytes() == b"old"
-    with pytest.raises(InputError, match="exists already"):
-        refuse_existing(target)
+    refuses(InputError, "exists already", refuse_existing, target)
 
 
 def test_overwrite_replaces(tmp_path):
@@ -68,10 +66,8 @@ def test_devices_and_pipes_are_never_replaced(tmp_path):
     os.mkfifo(pipe)
     for target in (pipe, "/dev/null", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"):
         assert is_stream(target)
-        with pytest.raises(InputError, match="is a device or a pipe, .*; choose another name"):
-            Draft(target, overwrite=True)
-    with pytest.raises(InputError, match="pipe: is a device or a pipe"):
-        refuse_existing(pipe)
+        refuses(InputError, "is a device or a pipe, .*; choose another name", Draft, target, overwrite=True)
+    refuses(InputError, "pipe: is a device or a pipe", refuse_existing, pipe)
     assert names(tmp_path) == ["pipe"]
     for name in (tmp_path / "a", tmp_path, tmp_path / "none" / "a", "/dev/shm/a"):
         assert not is_stream(name)
@@ -95,10 +91,8 @@ def test_text_goes_into_a_pipe_that_somebody_reads(tmp_path):
 
 def test_a_dangling_link_is_not_written_through(tmp_path):
     (tmp_path / "a").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(InputError, match="exists already"):
-        refuse_existing(tmp_path / "a")
-    with pytest.raises(InputError, match="exists already"):
-        publish_together([write(tmp_path / "a", b"new")])
+    refuses(InputError, "exists already", refuse_existing, tmp_path / "a")
+    refuses(InputError, "exists already", publish_together, [write(tmp_path / "a", b"new")])
     assert names(tmp_path) == ["a"]
 
 
@@ -114,8 +108,7 @@ def test_the_same_bytes_count_as_published_where_asked(tmp_path):
 def test_a_pair_is_taken_back_when_its_second_half_fails(tmp_path):
     first, second = write(tmp_path / "a.wdp", b"1"), write(tmp_path / "a.las", b"2")
     (tmp_path / "a.las").write_bytes(b"other")
-    with pytest.raises(InputError, match="a.las: exists already"):
-        publish_together([first, second])
+    refuses(InputError, "a.las: exists already", publish_together, [first, second])
     assert names(tmp_path) == ["a.las"] and (tmp_path / "a.las").read_bytes() == b"other"
 
 
@@ -127,8 +120,7 @@ def test_file_systems_without_links_still_never_replace(tmp_path, monkeypatch, n
     monkeypatch.setattr(publish.os, "link", refuse)
     write(tmp_path / "a", b"one").publish()
     assert (tmp_path / "a").read_bytes() == b"one"
-    with pytest.raises(InputError, match="exists already"):
-        publish_together([write(tmp_path / "a", b"two")])
+    refuses(InputError, "exists already", publish_together, [write(tmp_path / "a", b"two")])
     assert names(tmp_path) == ["a"] and (tmp_path / "a").read_bytes() == b"one"
 
 
@@ -206,8 +198,7 @@ def test_a_missing_folder_is_one_line(tmp_path):
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_without_permission_is_one_line(tmp_path):
     tmp_path.chmod(0o500)
-    with pytest.raises(InputError, match="check the folder's permissions"):
-        Draft(tmp_path / "a", overwrite=False)
+    refuses(InputError, "check the folder's permissions", Draft, tmp_path / "a", overwrite=False)
 
 
 def test_permission_error_names_the_remedy(tmp_path, monkeypatch):
@@ -278,11 +269,9 @@ def test_numpy_reads_what_was_added(tmp_path, rng):
 
 
 def test_nothing_is_left_of_what_fails(tmp_path):
-    with pytest.raises(InputError, match="make the folder first"):
-        NpzWriter(tmp_path / "gone" / "a.npz", {"value": "f4"})
+    refuses(InputError, "make the folder first", NpzWriter, tmp_path / "gone" / "a.npz", {"value": "f4"})
     (tmp_path / "a.npz").write_text("old")
-    with pytest.raises(InputError, match="exists already"):
-        NpzWriter(tmp_path / "a.npz", {"value": "f4"})
+    refuses(InputError, "exists already", NpzWriter, tmp_path / "a.npz", {"value": "f4"})
     writer = NpzWriter(tmp_path / "b.npz", {"value": "f4"})
     writer.add({"value": np.zeros(3)})
     writer.close()
@@ -345,8 +334,7 @@ def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(
     (places / "sub" / "b.laz").write_bytes(b"")
     arguments = [str(places), str(places / "sub")]
     assert [path.name for path in find_files(arguments)] == ["a.LAZ", "b.las", "b.laz", "c.laz"]
-    with pytest.raises(ConfigError, match="both outputs would be named b"):
-        find_strips(arguments)
+    refuses(ConfigError, "both outputs would be named b", find_strips, arguments)
 
 
 def test_a_name_with_brackets_is_a_name(places):

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+from commands import refuses
 from pulse_files import Pulse, PulseFile, Sampling, bell
 
 from wavebatch.core.errors import InputError
@@ -85,8 +86,7 @@ def test_cut_waves_are_one_line(tmp_path, rng, left):
     _, path = _write(tmp_path, rng)
     waves = path.with_suffix(".wvs")
     waves.write_bytes(waves.read_bytes()[: left if left >= 0 else -1])
-    with pytest.raises(InputError, match=r"PulseWavesWaves|are not inside the file"):
-        list(_read(path))
+    refuses(InputError, r"PulseWavesWaves|are not inside the file", list, _read(path))
 
 
 def test_cut_pulses_are_one_line(tmp_path, rng):
@@ -126,15 +126,12 @@ def _set(path, at, form, value):
 def test_what_wavebatch_does_not_read_says_what_to_do(tmp_path, rng):
     _, path = _write(tmp_path, rng)
     _set(path, 204, "<I", 1)
-    with pytest.raises(InputError, match=r"compressed PulseWaves .* pulsezip -i a.pls"):
-        read_pulse_header(path)
+    refuses(InputError, r"compressed PulseWaves .* pulsezip -i a.pls", read_pulse_header, path)
     _, path = _write(tmp_path, rng)
     path.with_suffix(".wvs").rename(path.with_suffix(".wvz"))
-    with pytest.raises(InputError, match="pulsezip"):
-        read_pulse_header(path)
+    refuses(InputError, "pulsezip", read_pulse_header, path)
     path.with_suffix(".wvz").unlink()
-    with pytest.raises(InputError, match=r"put a\.wvs next to it"):
-        read_pulse_header(path)
+    refuses(InputError, r"put a\.wvs next to it", read_pulse_header, path)
 
 
 @pytest.mark.parametrize(
@@ -145,18 +142,15 @@ def test_what_wavebatch_does_not_read_says_what_to_do(tmp_path, rng):
 )  # fmt: skip
 def test_samplings_that_no_sensor_has_are_refused(tmp_path, sampling):
     path = PulseFile({1: [sampling]}, []).write(tmp_path / "a.pls")
-    with pytest.raises(InputError, match="descriptor 1"):
-        read_pulse_header(path)
+    refuses(InputError, "descriptor 1", read_pulse_header, path)
 
 
 def test_more_segments_than_a_sensor_has_are_damage(tmp_path):
     sampling = Sampling(segment_bits=16, duration_bits=0, length_bits=0, samples=0)
     file = PulseFile({1: [sampling]}, [Pulse([[(0, [])] * 300])])
-    with pytest.raises(InputError, match="pulse 0"):
-        list(_read(file.write(tmp_path / "a.pls")))
+    refuses(InputError, "pulse 0", list, _read(file.write(tmp_path / "a.pls")))
 
 
 def test_a_pulse_without_its_descriptor_is_named(tmp_path):
     file = PulseFile({1: [Sampling()]}, [Pulse([[(0, bell(9, 4, 9, 1))]]), Pulse([], descriptor=5)])
-    with pytest.raises(InputError, match="pulse 1 refers to descriptor 5"):
-        list(_read(file.write(tmp_path / "a.pls")))
+    refuses(InputError, "pulse 1 refers to descriptor 5", list, _read(file.write(tmp_path / "a.pls")))

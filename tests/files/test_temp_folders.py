@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import publish, temp_store
@@ -132,8 +133,7 @@ def test_without_a_place_the_spool_says_so(no_place):
     with temp_store.owning_scratch(no_place) as folder:
         assert folder is None
     spool = temp_store.Spool(2, np.dtype("<i8"), memory=1)
-    with pytest.raises(InputError, match="No such file.*set TMPDIR"):
-        spool.append(np.array([0, 1]), np.array([5, 6]))
+    refuses(InputError, "No such file.*set TMPDIR", spool.append, np.array([0, 1]), np.array([5, 6]))
 
 
 def test_a_spool_keeps_what_came_after_its_last_segment():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from commands import succeed
+from commands import refuses, succeed
 from naive_wdz import pack_strip
 
 from wavebatch.core.echoes import EchoFlag
@@ -80,9 +80,7 @@ def test_a_run_of_both_gives_the_same_points(plain, packed, tmp_path):
 
 def test_a_missing_or_contradicting_wdz_is_named(plain, packed, tmp_path):
     packed.with_suffix(".wdz").rename(tmp_path / "other.wdz")
-    with pytest.raises(InputError, match=r"put packed\.wdz next to the strip"):
-        StripReader(packed)
+    refuses(InputError, r"put packed\.wdz next to the strip", StripReader, packed)
     (tmp_path / "other.wdz").rename(plain.with_suffix(".wdz"))
     plain.with_suffix(".wdp").unlink()
-    with pytest.raises(InputError, match="its descriptors say that they are not compressed"):
-        StripReader(plain)
+    refuses(InputError, "its descriptors say that they are not compressed", StripReader, plain)

@@ -3,6 +3,7 @@
 import naive_fit
 import numpy as np
 import pytest
+from commands import refuses
 from fits import decompose, settings
 
 from wavebatch.kernels.fit.decompose import Candidates, Clusters, Samples, decompose_clusters, promise_echoes
@@ -397,13 +398,11 @@ def test_arrays_that_the_library_would_read_beyond_are_refused():
             decompose_clusters(samples._replace(**{name: value}), start, good, settings())
     shorter = (samples, start._replace(width=np.empty(0)), good), (samples, start, good._replace(low=np.zeros(2, int)))
     for wrong in shorter:
-        with pytest.raises(ValueError, match="differ in length"):
-            decompose_clusters(*wrong, settings())
+        refuses(ValueError, "differ in length", decompose_clusters, *wrong, settings())
     few = PulseShape(table=PulseTable(-1.0, 1.0, np.ones(1, np.float32), np.ones(1, np.float32), 0.0))
     for options in ({"shape": few}, {"width_ref": np.nan}, {"width_ref": np.inf}, {"width_ref": 0.0}):
         reason = "the table of a pulse must have" if "shape" in options else "the width of the pulse must be above 0"
-        with pytest.raises(ValueError, match=reason):
-            decompose_clusters(samples, start, good, settings()._replace(**options))
+        refuses(ValueError, reason, decompose_clusters, samples, start, good, settings()._replace(**options))
 
 
 def test_samples_that_are_missing_may_be_anything():

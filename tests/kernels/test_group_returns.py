@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.kernels.geometry.group_returns import (
     LONGEST_PULSE,
@@ -116,5 +117,4 @@ def test_offsets_are_those_of_a_loop(rng):
         expected = _offset_by_loop(time[rows] - return_time[match[rows]], error[rows])
         assert [column[w] for column in found] == pytest.approx(expected, rel=1e-9)
     assert 3 < np.count_nonzero(found[1]) < np.count_nonzero(found[2]) < 41
-    with pytest.raises(ValueError, match="no return or waveform"):
-        share_offsets(41, waveform, time, error, match, return_time[:1])
+    refuses(ValueError, "no return or waveform", share_offsets, 41, waveform, time, error, match, return_time[:1])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from commands import refuses
 from naive_packets import judge_packet
 
 from wavebatch.core.units import HALF_C, PS_PER_NS
@@ -69,7 +70,6 @@ def test_arrays_of_other_types_and_records_are_refused(rng):
     geometry = Geometry(False, UNIT, RANGE_RATIO, MAX_LOCATION)
     wide, apart, few = points["wavepacket_size"].astype("<u8"), points["x_t"].copy(), points["y_t"][:3]
     for change in ({"size": wide}, {"x": apart}, {"y": few}):
-        with pytest.raises(ValueError, match="must be of type"):
-            judge_packets(fields_of(points) | change, rules, geometry)
+        refuses(ValueError, "must be of type", judge_packets, fields_of(points) | change, rules, geometry)
     with pytest.raises(ValueError, match="256 rows"):
         judge_packets(fields_of(points), rules._replace(good=rules.good[:5].copy()), geometry)

@@ -9,7 +9,7 @@ import tempfile
 from types import SimpleNamespace
 
 import pytest
-from commands import run_command
+from commands import refuses, run_command
 
 import wavebatch as wb
 from wavebatch.core.errors import InputError
@@ -104,8 +104,7 @@ def test_a_checkout_that_cannot_be_written_runs_until_its_source_changes(checkou
     monkeypatch.setattr(tempfile, "TemporaryDirectory", refuse)
     assert load_number() == 1
     (checkout.SOURCES / "number.h").write_text("#define NUMBER 2\n")
-    with pytest.raises(InputError, match=r"cannot be built from its C sources: .*Permission denied"):
-        load_number()
+    refuses(InputError, r"cannot be built from its C sources: .*Permission denied", load_number)
 
 
 @needs_compiler
@@ -126,8 +125,7 @@ def test_without_a_compiler_pip_is_asked_for_one(checkout, monkeypatch, tmp_path
     assert "ziglang" in checkout.get_requires_for_build_wheel()
     assert "ziglang" in checkout.get_requires_for_build_editable()
     assert "ziglang" not in checkout.get_requires_for_build_sdist()
-    with pytest.raises(InputError, match="no C compiler found: install cc, gcc or clang, set CC, or `pip install"):
-        load_number()
+    refuses(InputError, "no C compiler found: install cc, gcc or clang, set CC, or `pip install", load_number)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "ziglang")
     assert checkout.find_compiler()[:4] == [sys.executable, "-m", "ziglang", "cc"]
     monkeypatch.setenv("CC", "ccache 'my cc' -pipe")
@@ -169,8 +167,7 @@ def test_a_damaged_library_is_refused_with_the_remedy(tmp_path, monkeypatch, dam
 @needs_compiler
 def test_a_library_without_our_functions_is_refused(checkout):
     (checkout.SOURCES / "library.c").write_text("int nothing;\n")
-    with pytest.raises(InputError, match="promise_echoes|decompose_clusters"):
-        load_number()
+    refuses(InputError, "promise_echoes|decompose_clusters", load_number)
 
 
 def test_commands_report_a_missing_library_once(tmp_path, monkeypatch):
@@ -184,6 +181,5 @@ def test_commands_report_a_missing_library_once(tmp_path, monkeypatch):
         assert done.exit_code == code
         assert done.stderr.count("\n") == 1 and done.stderr.startswith(f"error: {tmp_path / 'missing.so'}: ")
         assert "bug" not in done.stderr and "built again" in done.stderr
-    with pytest.raises(InputError, match=r"missing\.so: cannot be loaded"):
-        wb.run(strips, out)
+    refuses(InputError, r"missing\.so: cannot be loaded", wb.run, strips, out)
     assert not out.exists()

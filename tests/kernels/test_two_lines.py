@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.kernels.geometry.normals import Gap, Surroundings, measure_normals
 from wavebatch.kernels.geometry.planes import in_two_lines
@@ -38,8 +39,7 @@ def test_sets_on_two_lines_are_those_of_a_loop(rng):
     expected = [on_two_lines(u[group == one], v[group == one]) for one in range(400)]
     assert found.tolist() == [*expected, False]
     assert 50 < sum(expected) < 350
-    with pytest.raises(ValueError, match="no set"):
-        in_two_lines(u, v, group, 399)
+    refuses(ValueError, "no set", in_two_lines, u, v, group, 399)
 
 
 @pytest.mark.parametrize("degrees", range(0, 180, 13))

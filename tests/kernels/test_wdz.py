@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from commands import refuses
 from naive_wdz import Decoder, Differences, compress
 
 from wavebatch.kernels.packets import MOST_BYTES, decode_packets
@@ -91,7 +92,5 @@ def test_damaged_packets_are_flagged_or_decode_to_something(rng, bits):
 def test_places_outside_the_bytes_are_refused():
     data = np.zeros(100, np.uint8)
     for start, end in ((-1, 50), (0, 101), (60, 50)):
-        with pytest.raises(ValueError, match="inside"):
-            decode_packets(data, np.array([start]), np.array([end]), 10, 1)
-    with pytest.raises(ValueError, match="1 or 2"):
-        decode_packets(data, np.array([0]), np.array([50]), 10, 4)
+        refuses(ValueError, "inside", decode_packets, data, np.array([start]), np.array([end]), 10, 1)
+    refuses(ValueError, "1 or 2", decode_packets, data, np.array([0]), np.array([50]), 10, 4)

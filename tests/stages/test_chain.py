@@ -5,6 +5,7 @@ from typing import Annotated
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
@@ -145,10 +146,8 @@ def test_the_decorator_refuses_functions_that_are_no_stage(function, words):
 
 
 def test_the_decorator_refuses_unknown_kinds_and_second_names():
-    with pytest.raises(StageError, match="'filter' is not one of noise, detect, decompose, attribute"):
-        stage("filter")
-    with pytest.raises(StageError, match="noise.pooled is registered twice"):
-        stage("noise")(STAGES["noise.pooled"].function)
+    refuses(StageError, "'filter' is not one of noise, detect, decompose, attribute", stage, "filter")
+    refuses(StageError, "noise.pooled is registered twice", stage("noise"), STAGES["noise.pooled"].function)
 
 
 @pytest.mark.parametrize(

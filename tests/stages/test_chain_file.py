@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -113,21 +114,17 @@ def test_every_number_has_a_range_that_holds_its_default(name):
 def test_values_that_only_the_stage_knows_to_be_wrong_are_no_bugs(text, message):
     chain = parse_chain(_wrong('"detect.maximum"\nthreshold = 5', text), "x")
     block = WaveformBlock.from_samples(np.full((2, 40), 12, np.uint8))
-    with pytest.raises(ConfigError, match=message):
-        chain.run(block, SystemPulse(2.0))
+    refuses(ConfigError, message, chain.run, block, SystemPulse(2.0))
 
 
 def test_unreadable_chain_files_are_config_errors(tmp_path):
-    with pytest.raises(ConfigError, match=r"none\.toml: chain file cannot be read"):
-        load_chain_file(tmp_path / "none.toml")
+    refuses(ConfigError, r"none\.toml: chain file cannot be read", load_chain_file, tmp_path / "none.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="UTF-8"):
-        load_chain_file(tmp_path / "bytes.toml")
+    refuses(ConfigError, "UTF-8", load_chain_file, tmp_path / "bytes.toml")
 
 
 def test_unknown_profile_names_the_nearest():
-    with pytest.raises(ConfigError, match="did you mean 'balanced'"):
-        load_profile("balance")
+    refuses(ConfigError, "did you mean 'balanced'", load_profile, "balance")
 
 
 def test_choices_are_checked():

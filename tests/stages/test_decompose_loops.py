@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import naive
 import numpy as np
 import pytest
+from commands import refuses
 from given_echoes import known_noise, known_system, simulate_echoes
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
@@ -102,8 +103,7 @@ def test_asdf_only_keeps_the_echoes_of_the_detector_before_it():
 
 @pytest.mark.parametrize("detector", ["maximum", "wavelet", "threshold", "second_derivative", "richardson_lucy"])
 def test_asdf_only_refuses_detectors_without_a_reference(detector):
-    with pytest.raises(ConfigError, match="decompose.none"):
-        parse(f"detect.{detector}", "asdf_only")
+    refuses(ConfigError, "decompose.none", parse, f"detect.{detector}", "asdf_only")
 
 
 def test_the_error_of_the_parabola_covers_its_bias():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from commands import refuses
 from contract_tools import record
 from given_echoes import fine_recording, known_system
 from published import PULSE_SIGMA as SIGMA
@@ -35,8 +36,7 @@ def test_isolated_echoes_are_found_at_their_peak(name, parameters, off):
 @pytest.mark.parametrize("fraction", [0.0, 1.0])
 def test_a_fraction_must_be_one(fraction):
     block, noise = record(1, (20, [40.0]))
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        detect("constant_fraction", block, noise, fraction=fraction)
+    refuses(ValueError, "between 0 and 1", detect, "constant_fraction", block, noise, fraction=fraction)
 
 
 RATIOS = range(2, 9)

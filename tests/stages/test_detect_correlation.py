@@ -3,6 +3,7 @@
 import naive
 import numpy as np
 import pytest
+from commands import refuses
 from given_echoes import known_noise, known_system
 from published import WAGNER
 
@@ -172,8 +173,7 @@ def test_the_learned_pulse_is_a_reference_with_its_datum_in_the_middle():
 
 @pytest.mark.parametrize("pulse", ["", "1 2", "1 x 3", "0 0 0", "nan 1 1"])
 def test_what_is_no_pulse_is_refused(pulse):
-    with pytest.raises(ConfigError, match="pulse must"):
-        reference_pulse(SYSTEM, 1.0, "given", pulse=pulse)
+    refuses(ConfigError, "pulse must", reference_pulse, SYSTEM, 1.0, "given", pulse=pulse)
 
 
 def differences(a, b, n=4000):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
@@ -304,8 +305,7 @@ def test_echoes_of_no_waveform_are_refused(table):
     block = WaveformBlock.from_samples(np.zeros((N - 1, S), np.uint8))
     noise = Noise(np.zeros(N - 1, np.float32), np.ones(N - 1, np.float32))
     last = replace(table, waveform=np.maximum(table.waveform, N - 1))
-    with pytest.raises(ValueError, match="lies in no waveform"):
-        flag_echoes(block, noise, SystemPulse(2.0), last)
+    refuses(ValueError, "lies in no waveform", flag_echoes, block, noise, SystemPulse(2.0), last)
 
 
 def test_columns_and_factors_that_do_not_fit_are_refused(table):
@@ -313,16 +313,12 @@ def test_columns_and_factors_that_do_not_fit_are_refused(table):
     samples, none = Samples(np.zeros((N, S), np.uint8), ones, ones), Finishing()
     with pytest.raises(ValueError, match="more than one level"):
         finish_echoes(columns, row, samples._replace(baseline=np.ones((N, S), np.float32)), none)
-    with pytest.raises(ValueError, match="differ in length"):
-        finish_echoes(columns | {"sigma": table.sigma[1:]}, row, samples, none)
-    with pytest.raises(ValueError, match="differ in length"):
-        finish_echoes(columns, row[1:], samples, none)
+    refuses(ValueError, "differ in length", finish_echoes, columns | {"sigma": table.sigma[1:]}, row, samples, none)
+    refuses(ValueError, "differ in length", finish_echoes, columns, row[1:], samples, none)
     covering = Finishing(unexplained=unexplained(SystemPulse(2.0), 0.5))
     for factors in np.ones((len(table) - 1, 4)), np.ones((len(table), 3)):
-        with pytest.raises(ValueError, match="no factors"):
-            finish_echoes(columns, row, samples, covering, factors)
-    with pytest.raises(ValueError, match="how errors grow"):
-        finish_echoes(columns, row, samples, none, np.ones((len(table), 4)))
+        refuses(ValueError, "no factors", finish_echoes, columns, row, samples, covering, factors)
+    refuses(ValueError, "how errors grow", finish_echoes, columns, row, samples, none, np.ones((len(table), 4)))
 
 
 @pytest.mark.parametrize(("baseline", "spread", "floor"), [(2.9, 0.0, -np.inf), (3.1, 0.0, 0.0), (4.0, 1.0, -np.inf)])

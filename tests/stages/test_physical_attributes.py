@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import refuses
 from helpers_scenes import make_block
 
 from wavebatch.core.echoes import EchoFlag, EchoTable, NoData, count_reasons
@@ -421,8 +422,7 @@ def test_modes_and_decomposers_that_do_not_belong_together_say_nothing(decompose
 
 
 def test_widths_with_a_skew_per_echo_are_refused_before_a_run():
-    with pytest.raises(ConfigError, match="decompose.adaptive"):
-        chain_of("skewed", "system", kappa="free")
+    refuses(ConfigError, "decompose.adaptive", chain_of, "skewed", "system", kappa="free")
 
 
 @pytest.mark.parametrize("system", [SYSTEM, LEARNED], ids=["gaussian", "learned"])

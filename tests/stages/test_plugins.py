@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run_command
+from commands import refuses, run_command
 
 import wavebatch as wb
 from wavebatch.core.echoes import COLUMNS
@@ -127,8 +127,7 @@ def test_a_plugin_that_fails_to_import_is_named_in_one_line(installed, source, w
 def test_a_chain_without_plugins_imports_none(installed):
     installed("poor", "raise RuntimeError('imported')")
     assert wb.load_chain("accurate").steps
-    with pytest.raises(wb.ConfigError, match="unknown key"):
-        parse_chain('[[chain]]\nstage = "noise.pooled"\nguad = 3.0\n', "x")
+    refuses(wb.ConfigError, "unknown key", parse_chain, '[[chain]]\nstage = "noise.pooled"\nguad = 3.0\n', "x")
     assert "poor_stages" not in sys.modules
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import refuses
 from contract_tools import (
     SYSTEMS,
     assert_same,
@@ -293,8 +294,7 @@ def test_mixed_fits_only_where_detectors_disagree():
         assert_same(row[0], row[source])
         taken[source - 1] += 1
     assert taken.min() > 30
-    with pytest.raises(ConfigError, match="decompose.none"):
-        parse_chain(chain_text("asdf_mixed"), "c")
+    refuses(ConfigError, "decompose.none", parse_chain, chain_text("asdf_mixed"), "c")
 
 
 def chain_text(decomposer, *lines):

@@ -25,20 +25,24 @@ def record(*echoes, seed=1):
     return WaveformBlock.from_samples(np.rint(y).astype(np.uint16))
 
 
-def find(block, system=SYSTEM):
+def find(block, system=SYSTEM, level_err=None):
     noise = pooled(block, system)
+    noise = noise if level_err is None else replace(noise, baseline_err=np.full(len(block), level_err, np.float32))
     return adaptive(block, noise, system, maximum(block, noise, system))
 
 
 @pytest.mark.parametrize(("variance", "number"), [(0.0, 2), (400.0, 1)])
 def test_an_echo_that_more_than_noise_explains_is_left_out(variance, number):
     """12 counts beside 200: sure in noise, but not where as much is left beside strong echoes."""
-    block = record((200.0, 0.0), (12.0, 3.0))
-    found = find(block, replace(SYSTEM, beside=((-20.0, variance), (20.0, variance))))
+    block, system = record((200.0, 0.0), (12.0, 3.0)), replace(SYSTEM, beside=((-20.0, variance), (20.0, variance)))
+    found = find(block, system)
     assert (found.count(N) == number).mean() > 0.9
     assert (found.amplitude >= found.amplitude_err).all() and found.count(N).min() >= 1
     lone = found.alone(N)
     assert not (found.flags[lone] & int(EchoFlag.OVERLAPPED)).any()
+    # What the level's error does to a fit it does to the fit again, too.
+    known, free = (np.median(one.amplitude_err[one.amplitude > 100]) for one in (found, find(block, system, 5.0)))
+    assert abs(free / known - 1) > 0.04
 
 
 def test_rows_stay_sorted_and_other_waveforms_as_they_are():

@@ -5,8 +5,8 @@ import json
 import laspy
 import numpy as np
 import pytest
+from commands import fail, succeed
 from commands import run_command as call
-from commands import succeed
 
 import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
@@ -241,6 +241,5 @@ def test_a_strip_in_a_folder_is_never_replaced(flight, tmp_path):
     strip.write_bytes((folder / "a.las").read_bytes())
     for options, reason in ((("-o", strip), "must end in .toml; choose another name"),
                             (("-o", tmp_path / "cal.toml", "--report", strip), "would replace this input")):
-        done = call("calibrate", tmp_path, "--targets", folder / "t.csv", *options, "--overwrite")
-        assert done.exit_code == 2 and reason in done.stderr
+        fail(2, reason, "calibrate", tmp_path, "--targets", folder / "t.csv", *options, "--overwrite")
     assert strip.read_bytes() == (folder / "a.las").read_bytes()

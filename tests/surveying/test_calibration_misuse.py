@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import fail, refuses, succeed
 from commands import run_command as call
-from commands import succeed
 
 import wavebatch as wb
 from tests import footprints
@@ -185,9 +185,8 @@ def test_hillsides_under_dim_edges_have_errors_that_hold_and_a_term_that_is_righ
 
 
 def test_a_term_over_the_scan_angle_needs_overlap(dim_edges):
-    done = call("calibrate", dim_edges / "a.las", "--targets", dim_edges / "t.csv", "-o", dim_edges / "none.toml",
-                "--scan-angle")  # fmt: skip
-    assert done.exit_code == 1 and "the overlaps do not show the light at the edge of the swath to 5 %" in done.stderr
+    fail(1, "the overlaps do not show the light at the edge of the swath to 5 %", "calibrate", dim_edges / "a.las",
+         "--targets", dim_edges / "t.csv", "-o", dim_edges / "none.toml", "--scan-angle")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -817,12 +816,10 @@ def test_air_that_is_not_given_thins_with_the_height_above_sea(tmp_path, fall, g
 
 
 def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):
-    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", calibrated / "cal.toml",
-                "--attenuation", 0.0003)  # fmt: skip
-    assert done.exit_code == 2 and "less than any air has near the ground; is it per metre?" in done.stderr
-    done = call("calibrate", calibrated / "a.las", "--targets", calibrated / "t.csv", "-o", tmp_path / "c.toml",
-                "--attenuation", 0.0003)  # fmt: skip
-    assert done.exit_code == 2 and "is it per metre?" in done.stderr
+    fail(2, "less than any air has near the ground; is it per metre?", "run", calibrated / "a.las", "-o", tmp_path,
+         "--calibration", calibrated / "cal.toml", "--attenuation", 0.0003)  # fmt: skip
+    fail(2, "is it per metre?", "calibrate", calibrated / "a.las", "--targets", calibrated / "t.csv", "-o",
+         tmp_path / "c.toml", "--attenuation", 0.0003)  # fmt: skip
 
 
 def test_an_incidence_that_contradicts_the_plane_of_the_target_is_refused(tmp_path, calibrated):
@@ -850,8 +847,7 @@ def test_a_shuffled_log_of_energies_is_refused(tmp_path, rng):
     shuffled = zip(truth.gps_time, rng.permutation(truth.energy), strict=True)
     (tmp_path / "e.csv").write_text("time,energy\n" + "\n".join(f"{time:.9f},{one:.6f}" for time, one in shuffled))
     options = ("--columns", "+amplitude_normalized", "--energy", tmp_path / "e.csv")
-    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", *options)
-    assert done.exit_code == 4 and "--energy e.csv contradicts the strip" in done.stderr
+    fail(4, "--energy e.csv contradicts the strip", "run", tmp_path / "s.las", "-o", tmp_path / "out", *options)
 
 
 def test_degrees_without_a_crs_are_named(tmp_path):
@@ -861,8 +857,7 @@ def test_degrees_without_a_crs_are_named(tmp_path):
     struct.pack_into("<3d", content, 155, 11.0, 48.0, 0.0)
     struct.pack_into("<6d", content, 179, 11.003, 10.999, 48.004, 47.996, 1.0, -1.0)
     (tmp_path / "s.las").write_bytes(content)
-    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", "--columns", "range")
-    assert done.exit_code == 4 and "coordinates look like degrees" in done.stderr
+    fail(4, "coordinates look like degrees", "run", tmp_path / "s.las", "-o", tmp_path / "out", "--columns", "range")
 
 
 def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, calibrated, monkeypatch):
@@ -939,9 +934,8 @@ def test_reflectances_that_were_measured_from_aside_get_the_hot_spot(tmp_path, c
     assert found["geometry=backscatter"].constant == plain.constant
     assert aside.constant / plain.constant == pytest.approx(1 + 0.25 * 0.3 / 0.5)
     assert aside.relative_error == pytest.approx(np.hypot(plain.relative_error, 0.5 * 0.15 / 1.15), rel=0.01)
-    done = call("calibrate", calibrated / "a.las", "--targets", write_targets(tmp_path / "t.csv", "geometry=8/d"),
-                "-o", tmp_path / "d.toml")  # fmt: skip
-    assert done.exit_code == 2 and "geometry must be backscatter or directional or hemispherical" in done.stderr
+    fail(2, "geometry must be backscatter or directional or hemispherical", "calibrate", calibrated / "a.las",
+         "--targets", write_targets(tmp_path / "t.csv", "geometry=8/d"), "-o", tmp_path / "d.toml")  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -949,8 +943,7 @@ def test_reflectances_that_were_measured_from_aside_get_the_hot_spot(tmp_path, c
     [({"divergence": 0.0}, "--divergence 0.0"), ({"reflectance_error": 1.5}, "--reflectance-error 1.5")],
 )
 def test_python_checks_the_options_of_a_calibration_as_the_command_does(wrong, place):
-    with pytest.raises(ConfigError, match=f"{place}: must lie"):
-        CalibrationOptions(**wrong)
+    refuses(ConfigError, f"{place}: must lie", CalibrationOptions, **wrong)
 
 
 def test_clear_air_takes_less_of_long_waves_unless_its_attenuation_is_given():

@@ -4,6 +4,7 @@ import itertools
 from dataclasses import replace
 
 import pytest
+from commands import refuses
 from helpers_scenes import make_scene
 from strips import cut_strip
 
@@ -151,8 +152,7 @@ def test_a_strip_that_cannot_be_read_is_left_out(strips, tmp_path):
 def test_a_survey_of_one_strip_is_none_of_a_flight(strips):
     with StripReader(strips["flat"]) as reader, reader.scan() as scan:
         survey = survey_blocks(reader.sample_blocks(scan, 300))
-        with pytest.raises(ConfigError, match="holds no survey of a flight"):
-            hold_strip(reader, scan, SavedSurvey(survey))
+        refuses(ConfigError, "holds no survey of a flight", hold_strip, reader, scan, SavedSurvey(survey))
 
 
 @pytest.mark.slow

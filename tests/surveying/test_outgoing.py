@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
@@ -123,8 +124,7 @@ def test_without_a_file_of_outgoing_pulses_nothing_changes(tmp_path, sent):
     assert compare_outgoing(before, tmp_path / "other.las") is before
     strip, _ = sent()
     strip.with_suffix(".system.toml").write_text("x = ")
-    with pytest.raises(ConfigError, match=r"strip\.system\.toml"):
-        compare_outgoing(before, strip)
+    refuses(ConfigError, r"strip\.system\.toml", compare_outgoing, before, strip)
 
 
 def _strip(path, energies, light=None):
@@ -193,8 +193,7 @@ def test_a_column_that_knows_few_pulses_is_not_used_unless_asked_for(tmp_path):
     with StripReader(path) as reader, reader.scan() as scan:
         (said,) = take_energies(reader, scan, None).notes
     assert "fewer than 20 of the sampled pulses have one" in said
-    with pytest.raises(OSError, match="--energy pulse_energy knows 10 of 100"):
-        _filled(path, "pulse_energy")
+    refuses(OSError, "--energy pulse_energy knows 10 of 100", _filled, path, "pulse_energy")
     few = _strip(tmp_path / "few.las", np.ones(10))
     with StripReader(few) as reader, reader.scan() as scan:
         assert find_pulse_energy(reader, scan, None) is not None  # all that there are

@@ -7,6 +7,7 @@ import facet_strips
 import laspy
 import numpy as np
 import pytest
+from commands import refuses
 from facet_strips import EAST, NORTH, START, Facet, Sensor, path_of, write_strip
 
 from wavebatch.core.errors import InputError
@@ -328,8 +329,7 @@ def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_pa
     strip = write_strip(tmp_path / "a.las", [Facet(0.3)], Sensor(rate=5000.0, n_samples=40), 8000)
     assert (find(strip).kind == "direction vectors") == meets
     if apart[0]:
-        with pytest.raises(InputError, match="or to a part of this one"):
-            find(strip, trajectory=trajectory)
+        refuses(InputError, "or to a part of this one", find, strip, trajectory=trajectory)
 
 
 def test_a_digitizer_whose_vectors_contradict_a_trajectory_is_named(tmp_path, edit_points):
@@ -364,8 +364,7 @@ def test_vectors_are_wrong_only_where_enough_others_agree_at_that_time(second, m
     digitizer[second] = 7
     ahead[(np.arange(1000) >= 700) & (digitizer == 1)] += [60.0, 0.0, 0.0]
     rays = RaySample(np.arange(1000.0), ahead, vector, np.ones(1000), vector, digitizer)
-    with pytest.raises(InputError, match=message):
-        _disagreement(ahead, np.linalg.norm(ahead, axis=1), rays)
+    refuses(InputError, message, _disagreement, ahead, np.linalg.norm(ahead, axis=1), rays)
 
 
 def fly_level(view, height, *, seed=9, number=8000, degrees=0.0):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import refuses
 from helpers_scenes import make_block
 from hypothesis import given
 from hypothesis import strategies as st
@@ -141,8 +142,7 @@ def test_figures_decisions_and_fingerprint_may_be_missing():
 )
 def test_a_missing_quantity_is_named(key):
     text = re.sub(rf"^{key} = .*\n", "", TEXT, flags=re.M)
-    with pytest.raises(ConfigError, match=rf"x\.toml: \[system\]: key '{key}' is missing"):
-        parse_survey(text, "x.toml")
+    refuses(ConfigError, rf"x\.toml: \[system\]: key '{key}' is missing", parse_survey, text, "x.toml")
 
 
 def test_without_saturation_nothing_clips():
@@ -213,8 +213,7 @@ def test_files(tmp_path):
     assert load_survey(path).strip == ""
     assert [entry.name for entry in tmp_path.iterdir()] == ["SYSTEM.toml"]
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match="not UTF-8"):
-        load_survey(path)
+    refuses(ConfigError, "not UTF-8", load_survey, path)
 
 
 def test_files_from_before_the_skew_stay_readable():

@@ -6,8 +6,8 @@ from dataclasses import asdict, replace
 import laspy
 import numpy as np
 import pytest
+from commands import fail, succeed
 from commands import run_command as call
-from commands import succeed
 
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.files.strip.reader import StripReader
@@ -99,8 +99,7 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     inside = np.hypot(cloud.x - x, cloud.y - y) < 40
     rho = np.asarray(cloud["reflectance"])[inside]
     assert np.median(rho[rho != -9999]) == pytest.approx(0.2, rel=0.03)
-    done = call("calibrate", ground, "--targets", targets, "-o", cal)
-    assert done.exit_code == 1 and "exists" in done.stderr
+    fail(1, "exists", "calibrate", ground, "--targets", targets, "-o", cal)
     targets.write_text(f"reflectance,x,y,radius\n0.2,{x},{y + 30},20\n0.5,{x},{y - 30},20\n")
     done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "two.toml")
     assert done.exit_code == 0 and "warning: constants of the targets differ by a factor of 2." in done.stderr

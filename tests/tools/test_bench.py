@@ -23,7 +23,7 @@ from bench.promises import judge
 from bench.release import format_release, measure_cases
 from bench.stability import FAILURES
 from bench_tools import time_here
-from commands import succeed
+from commands import refuses, succeed
 
 import wavebatch
 from wavebatch.batch.workers.futures import WorkerDied
@@ -128,12 +128,9 @@ def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say(time
 
 
 def test_nothing_to_measure():
-    with pytest.raises(ConfigError, match="--scene"):
-        command.run_bench(command.BenchOptions())
-    with pytest.raises(ConfigError, match="forest"):
-        command.run_bench(command.BenchOptions(scenes=("forrest",)))
-    with pytest.raises(ConfigError, match="H14"):
-        list_cases(["H14"])
+    refuses(ConfigError, "--scene", command.run_bench, command.BenchOptions())
+    refuses(ConfigError, "forest", command.run_bench, command.BenchOptions(scenes=("forrest",)))
+    refuses(ConfigError, "H14", list_cases, ["H14"])
 
 
 @pytest.mark.slow
@@ -181,8 +178,7 @@ def test_scene_is_shaped_like_the_strip(tmp_path):
 
 def test_strip_too_short_to_resample(tmp_path):
     simulate_strip("flat", tmp_path / "short.las", pulses=50)
-    with pytest.raises(InputError, match="too few"):
-        command.shape_scene(tmp_path / "short.las", load_profile("fast"))
+    refuses(InputError, "too few", command.shape_scene, tmp_path / "short.las", load_profile("fast"))
 
 
 @pytest.mark.slow
@@ -267,8 +263,7 @@ def checkout(tmp_path):
 @pytest.mark.slow
 def test_two_checkouts_take_turns(tmp_path, checkout):
     options = ["--scene", "flat", "--pulses", "300", "--repeat", "2", "-o", str(tmp_path / "out")]
-    with pytest.raises(InputError, match="holds no wavebatch that Python can import"):
-        against.main([str(tmp_path), *options])
+    refuses(InputError, "holds no wavebatch that Python can import", against.main, [str(tmp_path), *options])
     against.main([str(checkout), *options])
     (ratios,) = json.loads((tmp_path / "out" / "against.json").read_text())["strips"].values()
     for name in ("cpu", "wall", "peak"):
@@ -400,8 +395,7 @@ def test_lengths(text, cm):
 
 @pytest.mark.parametrize("text", ["", "2", "cm", "-1cm", "0m", "2 km", "1e3mm", "nan m"])
 def test_no_lengths(text):
-    with pytest.raises(ConfigError, match="2cm"):
-        parse_length(text)
+    refuses(ConfigError, "2cm", parse_length, text)
 
 
 def make_row(name, microseconds, rmse, error=0.1, **figures):

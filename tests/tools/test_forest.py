@@ -5,7 +5,7 @@ import json
 import laspy
 import numpy as np
 import pytest
-from commands import run_command, succeed
+from commands import refuses, run_command, succeed
 from forest_scenes import fly, grow
 
 from wavebatch.core.errors import ConfigError
@@ -151,13 +151,10 @@ def test_voxels_have_what_forests_need(even, tmp_path):
 def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
     plain = tmp_path / "plain.laz"
     voxelize_strip(forest_strip, plain, VoxelOptions(1.0), system=SAVED, force=True)
-    with pytest.raises(ConfigError, match="--forest needs voxels: wavebatch voxelize"):
-        Forest([plain], 10.0, ForestOptions())
+    refuses(ConfigError, "--forest needs voxels: wavebatch voxelize", Forest, [plain], 10.0, ForestOptions())
     other = voxelize(forest_strip, tmp_path / "other.laz", size=2.0)
-    with pytest.raises(ConfigError, match="has other voxels"):
-        Forest([even[1], other], 10.0, ForestOptions())
-    with pytest.raises(ConfigError, match="cells need 4 voxels along a side; give 4 or more"):
-        Forest([even[1]], 3.0, ForestOptions())
+    refuses(ConfigError, "has other voxels", Forest, [even[1], other], 10.0, ForestOptions())
+    refuses(ConfigError, "cells need 4 voxels along a side; give 4 or more", Forest, [even[1]], 3.0, ForestOptions())
     with pytest.raises(ConfigError, match="layers are thinner than the voxels, .*; give 1 or more"):
         Forest([even[1]], 10.0, ForestOptions(layer=0.5))
     for wrong in ({"leaf_projection": 0.0}, {"layer": 0.0}, {"layer": np.nan}):
@@ -217,5 +214,4 @@ def test_a_damaged_record_of_voxels_is_one_line(even, tmp_path, facts):
     (record,) = [vlr for vlr in voxels.vlrs if vlr.user_id == "wavebatch" and vlr.record_id == 1]
     record.record_data = json.dumps({"forest": True} | facts).encode()
     voxels.write(tmp_path / "v.laz")
-    with pytest.raises(ConfigError, match="its record of voxels is damaged"):
-        Forest([tmp_path / "v.laz"], 10.0, ForestOptions())
+    refuses(ConfigError, "its record of voxels is damaged", Forest, [tmp_path / "v.laz"], 10.0, ForestOptions())

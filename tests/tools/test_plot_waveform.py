@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import run_command, succeed
+from commands import refuses, run_command, succeed
 from plot_tools import PULSE, make_chain, simulate
 from scipy.optimize import curve_fit
 from strips import make_raw
@@ -161,8 +161,7 @@ def test_pulses_are_found_by_time_and_flag(tiny_strip):
         (place,) = waveform.find_places(reader, scan, waveform.Wanted(times=(asked,)), None)
         (view,) = waveform.read_views(reader, scan, [place], chain, PULSE)
         assert view.gps_time == times[17]
-        with pytest.raises(ConfigError, match="nearest is"):
-            waveform.find_places(reader, scan, waveform.Wanted(times=(5.0,)), None)
+        refuses(ConfigError, "nearest is", waveform.find_places, reader, scan, waveform.Wanted(times=(5.0,)), None)
         bits = np.bitwise_or.reduce(np.concatenate([table.flags for _, table in tables]))
         assert bits
         flagged = sorted(
@@ -328,8 +327,7 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
             waveform.find_places(reader, scan, waveform.Wanted(random=40), None)
         # As many as a sheet holds.
         assert len(waveform.find_places(reader, scan, waveform.Wanted(sheet=True), None)) == 100
-        with pytest.raises(ConfigError, match="100 with --sheet"):
-            waveform.find_places(reader, scan, waveform.Wanted(most=30), None)
+        refuses(ConfigError, "100 with --sheet", waveform.find_places, reader, scan, waveform.Wanted(most=30), None)
     target = tmp_path / "sheet.svg"
     words = (tiny_strip, "-o", target, "--random", 9, "--seed", 1, "--sheet", "--profile", "fast", "--overwrite")
     result = run(*words)
@@ -457,8 +455,7 @@ def test_the_chains_own_detector_keeps_its_parameters():
     chain = make_chain("decompose.gaussian")
     assert choose_step(chain, "detector") is chain.steps[1]
     assert choose_step(chain, "asdf").stage.name == "detect.asdf"
-    with pytest.raises(ConfigError, match="must be one of detector, asdf"):
-        choose_step(chain, "spline")
+    refuses(ConfigError, "must be one of detector, asdf", choose_step, chain, "spline")
     (view,) = build_views(BLOCK.rows(slice(0, 1)), chain, PULSE, [0], "wavelet")
     assert view.seen.stage == "detect.wavelet, which the chain does not use"
     (view,) = build_views(BLOCK.rows(slice(0, 1)), chain, PULSE, [0], "detector")

@@ -7,8 +7,8 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+from commands import fail, refuses, succeed
 from commands import run_command as run
-from commands import succeed
 from plot_tools import write_cloud
 from writer_tools import write_points
 
@@ -170,18 +170,15 @@ def test_slices_of_the_cube(tmp_path):
     assert np.array_equal(t.image, values[:, :, 2]) and t.title == "t = 1 ns" and (x.down, t.down) == (True, False)
     assert len(cut_cube(path, dict.fromkeys("xyt"))) == 3
     for wrong, message in (({"y": 8}, "scan lines 7 to 9"), ({"x": 3}, "0 to 2"), ({"t": 9.0}, "0 to 1.5 ns")):
-        with pytest.raises(ConfigError, match=message):
-            cut_cube(path, {"x": None, "y": None, "t": None, **wrong})
-    with pytest.raises(InputError, match="no scan line"):
-        build_cube(tmp_path / "empty.npz", [])
+        refuses(ConfigError, message, cut_cube, path, {"x": None, "y": None, "t": None, **wrong})
+    refuses(InputError, "no scan line", build_cube, tmp_path / "empty.npz", [])
 
 
 def test_slice_writes_cube_and_overview_once(riegl, tmp_path):
     words = ("slice", riegl, "--lines", "0:5", "--shortest", 10, "--cube", tmp_path / "c.npz", "--overview")
     assert run(*words, tmp_path / "o.png").exit_code == 0
     first = (tmp_path / "c.npz").read_bytes()
-    refused = run(*words, tmp_path / "o.png")
-    assert refused.exit_code == 1 and "--overwrite" in refused.stderr
+    fail(1, "--overwrite", *words, tmp_path / "o.png")
     assert run(*words, tmp_path / "o.png", "--overwrite").exit_code == 0
     assert (tmp_path / "c.npz").read_bytes() == first, "the same input gives the same bytes"
     assert sorted(path.name for path in Path(tmp_path).iterdir()) == ["c.npz", "o.png"]
@@ -251,8 +248,7 @@ def test_a_folder_with_clouds_and_tables_gives_the_clouds(cloud, tmp_path):
     result = run("plot", "profile", tmp_path, "-o", tmp_path / "p.png", "--json", "-q")
     assert json.loads(result.stdout)["clouds"] == [str(cloud)]
     (tmp_path / "list.txt").write_text("s.csv\n")
-    result = run("plot", "section", f"@{tmp_path / 'list.txt'}", "-o", tmp_path / "q.png")
-    assert result.exit_code == 2 and "segments have no side view" in result.stderr
+    fail(2, "segments have no side view", "plot", "section", f"@{tmp_path / 'list.txt'}", "-o", tmp_path / "q.png")
 
 
 @pytest.mark.parametrize("many", [40, 3000])

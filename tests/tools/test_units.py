@@ -6,7 +6,7 @@ import shutil
 import struct
 
 import pytest
-from commands import run_command, succeed
+from commands import refuses, run_command, succeed
 from strips import add_record
 
 from wavebatch.core.errors import ConfigError
@@ -123,8 +123,7 @@ def test_pictures_name_the_unit_of_heights(clouds):
     units = {name: (found.facts.unit, found.label.split(" of ")[0].split()[-1]) for name, found in made.items()}
     assert units == {"m": ("m", "m"), "ft": ("us-ft", "us-ft"), "deg": ("m", "m")}
     assert "of height" in made["m"].label
-    with pytest.raises(ConfigError, match="coordinates are degrees, heights are not"):
-        cut_section([clouds["deg"]], "z")
+    refuses(ConfigError, "coordinates are degrees, heights are not", cut_section, [clouds["deg"]], "z")
 
 
 def test_bands_of_rasters_name_the_unit_of_heights(clouds, tmp_path):

@@ -9,6 +9,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
+from commands import refuses
 from packet_strips import LENGTHS, draw_canopy, record, render, write_recorded
 
 from wavebatch.core.errors import ConfigError, InputError
@@ -332,8 +333,7 @@ def test_strips_in_degrees_are_refused(tmp_path):
     wkt = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],' \
         'UNIT["degree",0.0174532925199433]]'  # fmt: skip
     strip = write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30, point_format=9, wkt=wkt)
-    with pytest.raises(InputError, match="degrees"):
-        voxelize(strip, tmp_path / "v.npz", 1.0)
+    refuses(InputError, "degrees", voxelize, strip, tmp_path / "v.npz", 1.0)
 
 
 def test_light_goes_out_along_the_ray_and_empty_voxels_are_written_on_request(tmp_path):
