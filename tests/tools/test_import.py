@@ -282,6 +282,17 @@ def test_pulses_without_time_get_one(tmp_path):
     assert np.allclose(np.diff(_points(tmp_path / "o.las")[1]["gps_time"]), 1e-4)
 
 
+def test_waves_of_another_file_are_named(tmp_path, rng):
+    """Nothing in a .wvs says which .pls it belongs to."""
+    path = _make(tmp_path, list(_flight(rng)))
+    assert not any("another file" in note for note in import_file(path, tmp_path / "a.las", ImportOptions()).notes)
+    with path.with_suffix(".wvs").open("ab") as waves:
+        waves.write(bytes(9))
+    size = path.with_suffix(".wvs").stat().st_size
+    (note,) = [one for one in import_file(path, tmp_path / "b.las", ImportOptions()).notes if "another file" in one]
+    assert note.startswith(f"its pulses use {size - 9} of the {size} bytes of {path.stem}.wvs")
+
+
 def test_a_cut_file_leaves_nothing_behind(tmp_path, rng):
     path = _make(tmp_path, list(_flight(rng)))
     waves = path.with_suffix(".wvs")

@@ -176,7 +176,10 @@ def import_file(
                 with reporting(draft.target):
                     draft.file.write(format_survey(saved).encode())
                 counts.system_file = str(draft.target)
+            end = 0
             for piece in reader.pieces():
+                some = piece.segments
+                end = max(end, int((some.offset + some.length * (some.bits // 8)).max(initial=0)))
                 points = build_points(
                     frame.place(piece), plan, writer, header, counts, detect=options.returns == "detect"
                 )
@@ -184,6 +187,9 @@ def import_file(
                 progress(len(piece.pulses))
             writer.commit()
     notes = []
+    if end < header.waves_size:  # nothing in a .wvs names its .pls
+        used = f"{end} of the {header.waves_size} bytes of {header.waves.name}"
+        notes.append(f"its pulses use {used}, which may be that of another file: then its points are wrong")
     if plan.one_time:
         notes.append("all pulses have the same time; they get times 0.1 ms apart")
     if plan.unknown:
