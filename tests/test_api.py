@@ -6,6 +6,7 @@ import inspect
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -318,6 +319,10 @@ def test_wrong_use_is_said_in_the_words_of_the_user(strips, tmp_path):
         survey, block = wb.survey(strip), next(strip.blocks())
     with pytest.raises(TypeError, match="such as survey.system, not <class '.*Survey'>"):
         wb.load_chain("fast").run(block, survey)
+    silent = replace(survey.system, noise=wb.ReceiverNoise(std=0.0))
+    with pytest.raises(wb.ConfigError, match=r"noise.std of a SystemPulse must be above 0 counts, got 0.0"):
+        wb.load_chain("fast").run(block, silent)
+    assert "1 failed: none.las: cannot be read" in repr(wb.run("none.las", tmp_path))
     with pytest.raises(ValueError, match="is closed: use it inside its `with`"):
         next(strip.blocks())
     with pytest.raises(wb.ConfigError, match=r"--output .*out\.laz: this is a folder.* such as .*out$"):

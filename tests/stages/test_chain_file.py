@@ -79,6 +79,7 @@ def _wrong(old, new):
         (_wrong('"noise.pooled"', "7"), ["[[chain]] 1", "stage must be a string"]),
         (_wrong("= 5", "= "), ["not valid TOML", "line 6"]),
         ("[chain]\nstage = 'noise.pooled'", ["[[chain]]"]),
+        ("[chain]\nstage = 'noise.pooled'\n[chain]\n", ["not valid TOML", "several times is written [[name]]"]),
         ("[[chian]]\nstage = 'noise.pooled'", ["'chian'", "'chain'?"]),
         ("jobs = 3\n" + GOOD, ["'jobs'"]),
         ("", ["needs one noise"]),

@@ -60,11 +60,12 @@ class BatchResult:
     seconds: float
 
     def __repr__(self) -> str:
-        """One line: a prompt or a notebook prints it."""
+        """One line, with the first failure: a prompt or a notebook prints it."""
         names = [outcome.status for outcome in self.outcomes]
         written = f"{names.count('written')} strip{'s' * (names.count('written') != 1)} written"
         others = ", ".join(f"{names.count(name)} {name}" for name in ("skipped", "incomplete", "failed"))
-        return f"BatchResult({written}, {others})"
+        error = next((f": {outcome.error}" for outcome in self.outcomes if outcome.error is not None), "")
+        return f"BatchResult({written}, {others}{error})"
 
     @property
     def failed(self) -> int:

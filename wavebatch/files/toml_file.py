@@ -152,7 +152,8 @@ def parse_toml(text: str, name: str) -> TomlTable:
     except RecursionError as error:
         raise ConfigError(f"{name}: keys or values are nested more than {MOST_NESTED} deep") from error
     except ValueError as error:
-        raise ConfigError(f"{name}: not valid TOML: {_one_line(str(error))}") from error
+        hint = "; a table that stands several times is written [[name]]" if "twice" in str(error) else ""
+        raise ConfigError(f"{name}: not valid TOML: {_one_line(str(error))}{hint}") from error
     return TomlTable(document, name)
 
 

@@ -434,6 +434,8 @@ class Chain:
         """Return the block without the strip's defects, its noise, and the system of its digitizer."""
         if not isinstance(system, SystemPulse):
             raise TypeError(f"a chain runs with a block and a SystemPulse, such as survey.system, not {type(system)}")
+        if not 0 < system.noise.std < np.inf:
+            raise ConfigError(f"noise.std of a SystemPulse must be above 0 counts, got {system.noise.std}")
         system = system.of(block)
         self.check(system)
         cleaned = clean_block(block, system)
