@@ -246,3 +246,25 @@ def test_a_trajectory_that_does_not_cover_the_strip_is_told_with_counts(tmp_path
     told = float(line.split("there (")[1].split(" %")[0])
     assert told == pytest.approx(share, abs=2)
     assert f"{START_TIME + last:.2f} to" in line or f"to {START_TIME + first:.2f} s" in line
+
+
+def test_returns_off_their_ray_are_in_the_error_and_in_a_line(tmp_path, edit_points):
+    """Vendors of bathymetry bend light at the water: bottoms were .8 m below their returns, with errors of 3 mm."""
+
+    def bend(points):
+        second = np.flatnonzero((points["bit_fields"] & 7) == 2)
+        for axis in "XYZ":
+            points[axis][second] = points[axis][second - 1] + 0.75 * (points[axis][second] - points[axis][second - 1])
+        return points
+
+    simulate_strip("urban", tmp_path / "a.las", pulses=6000, seed=3)
+    edit_points(tmp_path / "a.las", tmp_path / "b.las", bend)
+    lines = {}
+    for name in "ab":
+        done = succeed("run", tmp_path / f"{name}.las", "-o", tmp_path / name, "--profile", "fast")
+        lines[name] = "second lies off its ray" in done.stderr
+    assert lines == {"a": False, "b": True}
+    clouds = [laspy.read(tmp_path / name / f"{name}.laz") for name in "ab"]
+    number, before, after = clouds[0].return_number, *(cloud["range_err"] for cloud in clouds)
+    assert (before[number == 1] == after[number == 1]).all()
+    assert np.median(after[number == 2]) > 10.0 * np.median(before[number == 2])

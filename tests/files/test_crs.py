@@ -248,7 +248,7 @@ def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
     }
     assert done["m"].exit_code == 0 and "in feet" not in done["m"].stderr
     with StripReader(feet) as reader, reader.scan() as scan:
-        scale = measure_scale(reader, scan)
+        scale = measure_scale(reader, scan).scale
     if scene == "urban":
         assert scale == pytest.approx(1 / 0.3048, rel=0.001)
         assert done["feet"].exit_code == 4

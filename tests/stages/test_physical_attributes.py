@@ -504,12 +504,15 @@ ERROR = 0.02
 """Of the fitted times [ns]."""
 
 
-def place(times, locations, **errors):
-    """x and range_err of echoes at `times` in one packet whose returns lie at `locations` [m along the ray]."""
+def place(times, locations, aside=0.0, **errors):
+    """x and range_err of echoes at `times` in one packet whose returns lie at `locations` [ns along the ray], the last
+    one `aside` [ns] of it."""
     block = WaveformBlock.from_samples(np.zeros((1, 80), np.uint8))
-    k = len(locations)
-    returns = ReturnTable(np.zeros(k, np.int32), np.array(locations, float), np.arange(k), np.zeros((k, 3)))
-    block = replace(block, returns=returns, direction=np.array([[HALF_C, 0.0, 0.0]]))
+    k, direction = len(locations), np.array([[HALF_C, 0.0, 0.0]])
+    xyz = block.origin + np.array(locations, float)[:, None] * direction
+    xyz[-1, 2] += aside * HALF_C
+    returns = ReturnTable(np.zeros(k, np.int32), np.array(locations, float), np.arange(k), xyz)
+    block = replace(block, returns=returns, direction=direction)
     n = len(times)
     echoes = EchoTable.build(np.zeros(n), np.array(times), np.full(n, 50.0), np.full(n, 2.0),
                              time_err=np.full(n, ERROR))  # fmt: skip
@@ -535,6 +538,15 @@ def test_an_added_echo_has_the_error_of_its_packet():
 def test_returns_that_agree_within_their_errors_leave_the_error_of_the_fit(locations):
     _, error = place([20.0, 40.0, 60.0][: len(locations)], locations)
     assert error == pytest.approx(ERROR, rel=1e-3)
+
+
+@pytest.mark.parametrize(("aside", "held"), [(5.0, 5.0), (0.9, 0.0)])
+def test_returns_off_the_ray_are_in_the_errors_of_their_echoes(aside, held):
+    """Vendors bend rays at water; a location may be rounded to a sample, which is no bend."""
+    at, error = place([20.0, 40.0, 60.0], [20.0, 40.0], aside=aside)
+    assert at == pytest.approx([20.0, 40.0, 60.0], abs=1e-3)
+    assert error == pytest.approx([ERROR, np.hypot(ERROR, held), np.hypot(ERROR, held)], rel=1e-3)
+    assert place([20.0], [20.0], aside=5.0)[1] == pytest.approx(ERROR, rel=1e-3)
 
 
 def test_returns_have_their_scatter_and_echoes_without_one_the_phase():

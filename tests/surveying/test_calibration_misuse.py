@@ -18,7 +18,7 @@ from tests.facet_strips import C_AIR, EAST, NORTH, START, Facet, Sensor, box, pa
 from tests.footprints import Flight, Plane
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import Digitizer, SystemPulse
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import PairScale, StripReader
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating import calibrate_flight
@@ -861,7 +861,7 @@ def test_degrees_without_a_crs_are_named(tmp_path):
 
 
 def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, calibrated, monkeypatch):
-    monkeypatch.setattr(sensor, "measure_scale", lambda reader, scan: 3.281)
+    monkeypatch.setattr(sensor, "measure_scale", lambda reader, scan: PairScale(3.281))
     metres = SimpleNamespace(is_metric=True, horizontal=1.0)
     with StripReader(calibrated / "a.las") as reader, reader.scan() as scan:
         facts = SimpleNamespace(path="a.las", units=[metres], header=reader.facts.header)

@@ -7,9 +7,10 @@ import facet_strips
 import laspy
 import numpy as np
 import pytest
-from commands import refuses
+from commands import refuses, succeed
 from facet_strips import EAST, NORTH, START, Facet, Sensor, path_of, write_strip
 
+import wavebatch as wb
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import ADJUSTED, Trajectory
 from wavebatch.core.units import HALF_C
@@ -314,6 +315,44 @@ def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
         with pytest.raises(InputError, match=message) as caught:
             find_sensor(reader, replace(scan, vectors=replace(scan.vectors, ratio=ratio)), SensorRequest())
     assert "\n" not in str(caught.value) and "project the strip" in str(caught.value)
+
+
+def test_times_rounded_to_seconds_make_no_pairs_of_returns(tmp_path, edit_points):
+    """Neighbouring pulses of one time were taken for returns of one: ranges were 383 m off, with errors of 2.5 m."""
+
+    def round_times(points):
+        points["gps_time"] = np.round(points["gps_time"])
+        return points
+
+    flight = Sensor(rate=10_000.0, n_samples=40, line_rate=100.0, half_angle=14.6, speed=33.0, height=429.0)
+    strip = write_strip(tmp_path / "a.las", [Facet(0.3, slope=(-0.08, -0.03))], flight, 12_000)
+    assert find(edit_points(strip, tmp_path / "b.las", round_times)).kind != "pairs of returns"
+
+
+@pytest.mark.parametrize(
+    ("change", "turned"),
+    [
+        (lambda x, y, z: (x, y, z), (0.0, 0.15)),
+        (lambda x, y, z: (y, x, z), (4.0, 15.0)),
+        (lambda x, y, z: (0 * x, 0 * y, z.mean() + 0 * z), (89.0, 91.0)),
+    ],
+    ids=["right", "swapped", "vertical"],
+)
+def test_vectors_that_do_not_meet_prove_no_angle(tmp_path, edit_points, change, turned):
+    """Angles by normals were up to 3 degrees off, with errors of .14."""
+
+    def edit(points):
+        points["x_t"], points["y_t"], points["z_t"] = change(points["x_t"], points["y_t"], points["z_t"])
+        return points
+
+    flight = Sensor(rate=10_000.0, n_samples=40, line_rate=100.0, heading=60.0, speed=33.0)
+    strip = write_strip(tmp_path / "a.las", [Facet(0.3, slope=(0.1, -0.05))], flight, 12_000)
+    strip = edit_points(strip, tmp_path / "b.las", edit)
+    assert turned[0] <= find(strip).turned <= turned[1]
+    columns = "+incidence_angle_normals,+incidence_angle_normals_err"
+    succeed("run", strip, "-o", tmp_path / "out", "--profile", "fast", "--columns", columns)
+    angle = wb.read_cloud(tmp_path / "out" / "b.laz")["incidence_angle_normals"]
+    assert np.isfinite(angle).mean() == pytest.approx(float(turned[1] < 1.0), abs=0.1)
 
 
 @pytest.mark.parametrize("turns", [0, 2, 4])

@@ -234,11 +234,13 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> UnitResult:
     by_echo = np.zeros(len(made.counted), found.dtype)
     by_echo[made.echo[has_echo]] = found[has_echo]
     first, *_ = names = field_names(found.dtype)[:-1]
+    if f"{first}_err" in names and prepared.second_step is not None:
+        # A ray that is off turns the angle by as much: no plane of points shows it.
+        error = by_echo[f"{first}_err"] = np.hypot(by_echo[f"{first}_err"], np.float32(prepared.sensor.turned))
+        most = prepared.second_step.effective().get("max_error", np.inf)
+        by_echo["gap"][(by_echo["gap"] == normals.Gap.KNOWN) & (error > most)] = normals.Gap.UNCERTAIN
     known = by_echo["gap"] == normals.Gap.KNOWN
     values = {name: np.where(known, by_echo[name], np.float32(np.nan)) for name in names}
-    if f"{first}_err" in values:
-        # A ray that is off turns the angle by as much: no plane of points shows it.
-        values[f"{first}_err"] = np.hypot(values[f"{first}_err"], np.float32(prepared.sensor.turned))
     values[f"{first}{SUFFIX}"] = _REASONS[by_echo["gap"]]
     if solved:
         # Stages that need the columns of the second pass; these (k,) are by packet, as `gather_echoes` sorts.

@@ -60,7 +60,7 @@ WARNINGS = {
     "reflectance": "more reflectances above 1 than surfaces explain",
     "beam": "the divergence contradicts the widths of the echoes",
     "zone": "echoes may have been taken for those of another pulse, so that ranges are off by hundreds of metres",
-    "units": "coordinates may be in other units than the vectors of the packets",
+    "units": "coordinates may be in other units than the vectors of the packets, or returns off their rays",
     "dropped-records": "records of the strip that its cloud does not have",
 }
 """What makes results of a strip doubtful, by a code that stays the same in later versions."""

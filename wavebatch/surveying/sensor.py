@@ -85,6 +85,9 @@ LEAST_AGREEING = 20
 """Fewest rays of other digitizers that must agree with a trajectory, each after a ray that does not, for vectors to be
 wrong and not the trajectory."""
 
+MOST_BENT = 0.1
+"""Share of pairs of returns that are off their ray, from which it is said: fewer are returns of two pulses."""
+
 SURE_HEIGHTS, LEAST_HEIGHTS = 4.0, 1e-3
 """Errors from which rays come from several heights: a twelfth of 1,000 rays shows that so, wherever they come from; and
 least standard deviation of these heights that counts, over the distance: drifts of attitude look like a tenth of it."""
@@ -181,7 +184,13 @@ class SensorSource:
     def doubt(self) -> str:
         """Return the line about what contradicts the range: vectors, relief or a trajectory; empty without any."""
         facts = dict(self.facts)
-        if spread := facts.get("do_not_meet_deg"):
+        spread = facts.get("do_not_meet_deg")
+        if spread == 0.0:
+            return (
+                "range: the packets' vectors are all parallel, as no scanner's are: they are no directions, new echoes "
+                "lie along them, and angles by normals are not known"
+            )
+        if spread:
             return (
                 f"range: the packets' vectors spread by {spread:.0f} degrees, but do not meet in a path of the sensor: "
                 "points and vectors are of two CRSs, axes are swapped, times are wrong or the same for two sensors; "
@@ -267,8 +276,12 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
         with np.errstate(invalid="ignore", divide="ignore"):
             unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
         spread = ray_convergence.measure_extent(unit)
-        if spread > LEAST_SPREAD:
+        if not LEAST_TURN < spread <= LEAST_SPREAD:
             facts["do_not_meet_deg"] = round(float(np.degrees(spread)), 1)
+            # Unless pairs of returns prove them, such vectors may be off by as much as they scatter, or by anything.
+            unproved = np.degrees(spread / 4.0 if spread > LEAST_SPREAD else 0.5 * np.pi)
+            if facts["turned_error_deg"] > np.degrees(0.25 * MOUNTING):
+                facts["turned_error_deg"] = round(float(unproved), 4)
     if request.height is None:
         return replace(UNKNOWN, facts=tuple(facts.items()))
     # An aircraft does not follow hills: their heights are in the error.
@@ -296,7 +309,7 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
         raise InputError(
             f"{path}: coordinates look like degrees, since all points lie within one unit, and no CRS says so: {remedy}"
         )
-    scale = measure_scale(reader, scan)
+    scale = measure_scale(reader, scan).scale
     if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
         raise InputError(
             f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
@@ -317,8 +330,8 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     """Raise InputError where packet vectors are in metres and coordinates in feet, or the other way round.
 
     New echoes lie along the vectors, so they would be up to metres from their place. Spacings of returns decide, not
-    the CRS: it may be missing or wrong. Without enough pairs of returns, a doubt is returned where the CRS and the
-    length of the vectors differ.
+    the CRS: it may be missing or wrong. Doubts are returned: where many second returns lie off their ray; and, without
+    enough pairs of returns, where the CRS and the length of the vectors differ.
     """
     path, units, ratio = reader.facts.path, reader.facts.units, scan.vectors.ratio
     along = next((unit.horizontal for unit in units if unit.horizontal is not None), None)
@@ -330,10 +343,17 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
             f"{path}: coordinates are degrees, packet vectors metres, so new echoes would be misplaced: project the "
             "strip with its vectors to metres, or write only its own points with --points returns"
         )
-    scale = measure_scale(reader, scan)
+    scale, bent, pairs = measure_scale(reader, scan)
+    bends: tuple[str, ...] = ()
+    if bent > MOST_BENT:
+        bends = (
+            f"in {bent:.0%} of {pairs} pairs of returns of one pulse the second lies off its ray by more than a tenth "
+            "of their distance: light is bent at water, or times or vectors are wrong; echoes are placed along "
+            "straight rays, and range_err holds how far returns are from there",
+        )
     if scale is None:
         doubt = "coordinates are in feet by the CRS, packet vectors as long as metres: added echoes may be far off"
-        return (doubt,) if is_feet and abs(ratio - 1.0) < 0.05 else ()
+        return (*bends, doubt) if is_feet and abs(ratio - 1.0) < 0.05 else bends
     kinds = ((FOOT, "in feet, packet vectors in metres"), (1 / FOOT, "in metres, packet vectors in feet"))
     for factor, words in kinds:
         if abs(scale * factor - 1.0) < 0.05:
@@ -342,7 +362,7 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
                 f"coordinates are {words}, so new echoes would be misplaced: project the strip to metres, or write "
                 "only its own points with --points returns"
             )
-    return ()
+    return bends
 
 
 def _from_file(

@@ -22,7 +22,7 @@ from wavebatch.core.order import distinct, even_places, find_order, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
-from wavebatch.files.las.header import locate, read_scanner
+from wavebatch.files.las.header import locate, read_scanner, split_numbers
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check, scanner
 from wavebatch.files.strip.packets import BLOCK_BYTES, PacketFile, StripFacts, find_facts
@@ -437,8 +437,9 @@ files hardly any is."""
 SCALE_PLACES = 16
 """Most places at which distances of returns are compared with their times."""
 
-LEAST_PAIRS, SCALE_SPREAD = 20, 0.05
-"""Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles."""
+LEAST_PAIRS, SCALE_SPREAD, BENT = 20, 0.05, 0.1
+"""Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles; and by
+how much, over their distance, returns of one pulse may be off its ray: their times may be rounded to samples."""
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """What steps through a strip have over a whole number, the next smaller one: those that are whole see one sensor only
@@ -484,7 +485,10 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
             ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
             good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
         away = np.where(good[:, None], away, np.nan)
-        place = np.flatnonzero(time[1:] == time[:-1])
+        # Coarse times are equal for neighbouring pulses too, whose points lie on no ray.
+        number, packet = split_numbers(points)[0], points["wavepacket_offset"]
+        of_pulse = (number[1:] > number[:-1]) | (packet[1:] == packet[:-1])
+        place = np.flatnonzero((time[1:] == time[:-1]) & of_pulse)
         apart = xyz[place + 1] - xyz[place]
         square = (apart * apart).sum(axis=1)
         far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
@@ -521,30 +525,41 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
     return samples[0], samples[1]
 
 
-def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
-    """Distance of returns of one pulse by their coordinates over that by their times in the packet.
+class PairScale(NamedTuple):
+    """How returns of one pulse lie by their coordinates, against their times in the packet and its vector."""
 
-    1 where coordinates and packet vectors have the same unit. From up to SCALE_PLACES places of the strip; None where
-    fewer than LEAST_PAIRS pairs of returns, or pairs that do not agree, show it.
-    """
-    ratios = [np.empty(0)]
+    scale: float | None = None
+    """Distance over that by their times: 1 where coordinates and vectors have the same unit; None where pairs do not
+    agree."""
+    bent: float = 0.0
+    """Share of the pairs whose second return lies off the ray of the first by BENT of their distance, and more."""
+    pairs: int = 0
+
+
+def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
+    """Compare returns of one pulse at up to SCALE_PLACES places of the strip; nothing with fewer than LEAST_PAIRS."""
+    ratios, bends = [np.empty(0)], [np.empty(0)]
     units = _choose_units(scan)
     for start, stop in units[:: max(1, -(-len(units) // SCALE_PLACES))]:
         points = reader.read_points(start, min(start + SLICE_POINTS, stop), scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
             vectors = packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
-            place = widen_integers(points["return_point_wave_location"])
+            place = np.diff(widen_integers(points["return_point_wave_location"]))
             same = (time[1:] == time[:-1]) & (points["wavepacket_offset"][1:] == points["wavepacket_offset"][:-1])
-            by_time = np.abs(np.diff(place)) * np.sqrt((vectors[1:] ** 2).sum(axis=1))
-            apart = np.sqrt((np.diff(xyz, axis=0) ** 2).sum(axis=1))
+            by_time = np.abs(place) * np.sqrt((vectors[1:] ** 2).sum(axis=1))
+            way = np.diff(xyz, axis=0)
+            apart = np.sqrt((way**2).sum(axis=1))
+            off = np.sqrt(((way + place[:, None] * vectors[1:]) ** 2).sum(axis=1))
             good = same & (points["wavepacket_index"][1:] > 0) & (by_time > _LEAST_PAIR) & np.isfinite(apart)
             ratios.append((apart / by_time)[good])
+            bends.append((off / by_time)[good])
     ratio = np.concatenate(ratios)
     if len(ratio) < LEAST_PAIRS:
-        return None
+        return PairScale()
     low, middle, high = (quantile(ratio, share) for share in (0.25, 0.5, 0.75))
-    return middle if high - low < SCALE_SPREAD * middle else None
+    bent = float(np.mean(np.concatenate(bends) > BENT))
+    return PairScale(middle if high - low < SCALE_SPREAD * middle else None, bent, len(ratio))
 
 
 def _choose_units(scan: StripScan) -> list[tuple[int, int]]:

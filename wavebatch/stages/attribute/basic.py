@@ -180,7 +180,8 @@ def position(
     Return locations differ from the fit by an offset that all returns of a packet share (phase of the emitted pulse, a
     detector of leading edges). The offset is measured on the matched returns and subtracted. Besides the error of the
     fit, range_err has that of the returns: their scatter in this strip, or, where the returns of a packet contradict
-    each other by more, the error of their mean. Packets without a matched return keep the raw location and are flagged;
+    each other by more, the error of their mean. Returns that lie off the packet's ray by more than a sample (bent at
+    a water surface) put that into it. Packets without a matched return keep the raw location and are flagged;
     their error has what locations differ from echoes.
 
     Parameters
@@ -196,6 +197,7 @@ def position(
     offset = np.zeros(len(block))
     doubt = np.zeros(len(block))
     known = np.zeros(len(block), bool)
+    most, bent = np.zeros(len(block)), np.zeros(len(echoes))
     point = np.full(len(echoes), -1, np.int64)
     returns = block.returns
     if returns is not None and len(returns):
@@ -208,6 +210,15 @@ def position(
             match = again
             offset, doubt, known = share_offsets(*own, match, returns.time)
         point = np.where(match >= 0, returns.point[match], -1)
+        several = np.flatnonzero(np.bincount(returns.waveform)[returns.waveform] > 1)
+        if len(several):
+            of, away = returns.waveform[several], np.zeros(len(returns))
+            off = returns.xyz[several] - block.origin[of] - block.direction[of] * returns.time[several, None]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                away[several] = np.sqrt((off * off).sum(axis=1) / (block.direction[of] ** 2).sum(axis=1))
+            away[away <= block.spacing] = 0.0  # a location may be rounded to a sample
+            np.maximum.at(most, returns.waveform, away)
+            bent = np.where(match >= 0, away[match], most[waveform])
     along = echoes.time - offset[waveform]
     # `take` copies whole rows: a tenth of the time of an index.
     xyz = block.origin.take(waveform, axis=0) + block.direction.take(waveform, axis=0) * along[:, None]
@@ -221,7 +232,9 @@ def position(
         y=xyz[:, 1],
         z=xyz[:, 2],
         point=point,
-        range_err=np.hypot(echoes.time_err * speed[waveform], shared[waveform]).astype(np.float32),
+        range_err=np.hypot(
+            echoes.time_err * speed[waveform], np.maximum(shared[waveform], bent * speed[waveform])
+        ).astype(np.float32),
     )
     if returns is None:
         return echoes
