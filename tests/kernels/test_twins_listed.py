@@ -34,12 +34,14 @@ COMPILED = {
     "share_offsets": ("share_offsets", "test_group_returns._offset_by_loop"),
     "measure_lobes": ("measure_pulse", "naive_fit.measure"),
     "find_two_lines": ("in_two_lines", "test_two_lines.on_two_lines"),
+    "trim_planes": ("fit_planes", "test_planes.naive_plane"),
+    "coloured_variance": ("colour_factors", "naive_signal.colour_factors"),
     "find_around": ("Surroundings", "test_planes._neighbours_by_loop"),
 }  # fmt: skip
 """Function of the library, the kernel that calls it, and the twin that a test compares that with."""
 
 HARD = {
-    "fit_planes": "test_planes.naive_plane", "find_lines": "naive_geometry.find_lines",
+    "find_lines": "naive_geometry.find_lines",
     "fit_sensor": "naive_geometry.fit_sensor", "find_rays": "naive_geometry.find_rays",
     "match_returns": "naive.match_returns",
     "cross_voxels": "test_voxel_kernels.walk", "angles_above": "naive_physics.angle_above",

@@ -46,10 +46,13 @@ def median(values: np.ndarray, axis: int | None = None) -> Any:
     n = values.shape[axis]
     if not n:
         return np.full(np.delete(values.shape, axis), np.nan)[()]
-    middle = [n // 2] if n % 2 else [n // 2 - 1, n // 2]
-    ordered = np.partition(values, [*middle, -1], axis=axis)
-    last = ordered.take(-1, axis=axis)  # NaN comes last
-    return np.where(np.isnan(last), last, np.mean(ordered.take(middle, axis=axis), axis=axis))[()]
+    # One place for `partition`: for two it takes up to eighteen times as long.
+    ordered = np.partition(values, n // 2, axis=axis)
+    ordered = np.moveaxis(ordered, axis, 0) if axis else ordered
+    last = ordered[n // 2 :].max(axis=0)  # NaN comes last
+    middle = ordered[n // 2] / 1
+    middle = middle if n % 2 else (ordered[: n // 2].max(axis=0) / 1 + middle) / 2
+    return np.where(np.isnan(last), last, middle)[()]
 
 
 def known_median(values: np.ndarray, axis: int) -> np.ndarray:

@@ -24,7 +24,7 @@ FUNCTIONS = (
     "describe_widths", "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes", "match_returns", "weigh_fits",
     "finish_echoes", "find_pulses", "find_nearest", "number_returns", "share_offsets", "find_around",
-    "measure_lobes", "find_two_lines",
+    "measure_lobes", "find_two_lines", "trim_planes", "coloured_variance",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -353,10 +353,9 @@ def call(name: str, *arguments: Any) -> int:
         There is not enough for its largest waveform or window.
     """
     given = [
-        part if not isinstance(part, np.ndarray | ctypes.Structure)
-        else ctypes.byref(part) if isinstance(part, ctypes.Structure)
-        else ctypes.byref(_BYTE(part)) if part.size and part.flags.carray  # a survey calls 3,000 times
-        else ctypes.c_void_p(part.ctypes.data)
+        (ctypes.byref(_BYTE(part)) if part.size and part.flags.carray else ctypes.c_void_p(part.ctypes.data))
+        if isinstance(part, np.ndarray)  # a survey calls 3,000 times
+        else ctypes.byref(part) if isinstance(part, ctypes.Structure) else part
         for part in arguments
     ]  # fmt: skip
     result = getattr(load(), name)(*given)

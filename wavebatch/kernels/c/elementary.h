@@ -49,3 +49,29 @@ EXPORT int64_t interpolate_columns(int64_t n, const double *x, int64_t k, int64_
     for (int64_t i = 0; i < n; i++) interpolate_row(x[i], k, m, at, table, out + i * m);
     return 0;
 }
+
+/* Sum of products, added in the order of NumPy's einsum on x86. */
+static double sum_products(int64_t n, const double *a, const double *b) {
+    double even = 0, odd = 0;
+    int64_t i = 0;
+    for (; i + 8 <= n; i += 8)
+        for (int64_t j = i + 6; j >= i; j -= 2) {
+            even += a[j] * b[j];
+            odd += a[j + 1] * b[j + 1];
+        }
+    for (; i < n; i += 2) {
+        even += a[i] * b[i];
+        if (i + 1 < n) odd += a[i + 1] * b[i + 1];
+    }
+    return even + odd;
+}
+
+/* Variances of r sums of samples with these weights, (r, s), in noise of variance 1 with k correlations from lag 1 on. */
+EXPORT int64_t coloured_variance(int64_t r, int64_t s, const double *weights, int64_t k, const double *correlation, double *variance) {
+    for (int64_t i = 0; i < r; i++, weights += s) {
+        variance[i] = sum_products(s, weights, weights);
+        for (int64_t lag = 1; lag <= k && lag < s; lag++)
+            variance[i] += 2 * correlation[lag - 1] * sum_products(s - lag, weights + lag, weights);
+    }
+    return 0;
+}

@@ -52,7 +52,8 @@ _TIGHT_ROUNDS = 3
 """Rounds in which sets that are not smooth use only the nearer points."""
 _ROUNDS = 8
 """Largest number of rounds."""
-_PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_MOVED, _NEW = 2, 3
+"""States of a set, as in kernels/c/planes.h; 0: it is done."""
 
 
 class Planes(NamedTuple):
@@ -104,52 +105,24 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
     ----------
     Rousseeuw and Van Driessen (1999): trimmed least squares with concentration steps.
     """
-    count = np.bincount(group, minlength=n)
-    x = np.ascontiguousarray(xyz.T)
-    whole = _sum_moments(x, group, n)
-    kept = np.ones(len(group), bool)
-    centre, spreads, axes = _solve(whole)
-    limit = np.full(n, np.inf)
-    active = np.flatnonzero(count > 0)
-    for number in range(_ROUNDS):
-        if not len(active):
+    xyz, group = np.ascontiguousarray(xyz, np.float64), np.asarray(group)
+    if len(group) != len(xyz) or (len(group) and not (0 <= group[0] <= group[-1] < n and (np.diff(group) >= 0).all())):
+        raise ValueError("points lie in no set, or not in the order of their sets")
+    start = np.zeros(n + 1, np.int64)
+    np.cumsum(np.bincount(group, minlength=n), out=start[1:])
+    axes, spreads, centre = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+    whole, kept, limit = np.zeros((n, 10)), np.ones(len(group), bool), np.full(n, np.inf)
+    covariance, state = np.empty((n, 3, 3)), np.full(n, _NEW, np.uint8)
+    found = axes, spreads, whole, kept, limit, centre, covariance, state
+    for number in range(1 + _ROUNDS):
+        tight = TIGHT if number <= _TIGHT_ROUNDS else 0.0
+        factors = map(ctypes.c_double, (SMOOTH, tight, OUTLYING * MAD_TO_STD, LEAST_SPREAD))
+        call("trim_planes", ctypes.c_int64(n), start, xyz, *factors, *found)
+        moved = np.flatnonzero(state == _MOVED)
+        spreads[moved], axes[moved] = np.linalg.eigh(covariance[moved])
+        if not state.any():
             break
-        # Rows of the points of active sets, and to which of these sets each belongs.
-        many = count[active]
-        local = np.repeat(np.arange(len(active)), many)
-        rows = np.arange(len(local)) + ((np.cumsum(count) - count)[active] - (np.cumsum(many) - many))[local]
-        at = group[rows]
-        middle, normal = (np.ascontiguousarray(part[active].T) for part in (centre, axes[:, :, 0]))
-        off = (x[0].take(rows) - middle[0].take(local)) * normal[0].take(local)
-        off += (x[1].take(rows) - middle[1].take(local)) * normal[1].take(local)
-        off += (x[2].take(rows) - middle[2].take(local)) * normal[2].take(local)
-        off = np.abs(off)
-        tight = (number < _TIGHT_ROUNDS) & (spreads[active, 0] > SMOOTH * spreads[active, 1])
-        # The median distance from a plane fitted to few points is too small (Rousseeuw and Leroy 1987).
-        few = 1.0 + 5.0 / np.maximum(count[active] - 3, 1)
-        factor = np.where(tight, TIGHT, OUTLYING * MAD_TO_STD * few)
-        # Upper medians: rows of a table, filled up with as many values below all others as above, so that the middle is
-        # in one place for all.
-        number_of = count[active]
-        width = int(number_of.max())
-        start = np.cumsum(number_of) - number_of
-        below = width // 2 - number_of // 2
-        table = np.full((len(number_of), width), np.inf)
-        table[np.arange(width) < below[:, None]] = -np.inf
-        table[local, np.arange(len(off)) - start[local] + below[local]] = off
-        limit[active] = factor * np.maximum(np.partition(table, width // 2, axis=1)[:, width // 2], LEAST_SPREAD)
-        near = off <= limit[at]
-        changed = np.bincount(local, near != kept[rows], minlength=len(active)) > 0
-        kept[rows] = near
-        # Few points are left out: to subtract them costs less than to add up all the others.
-        out = np.flatnonzero(changed[local] & ~near)
-        left_out = _sum_moments(x[:, rows[out]], local[out], len(active))
-        active, moved = active[changed | tight], active[changed]
-        if len(moved):
-            rest = [total[moved] - part[changed] for total, part in zip(whole, left_out, strict=True)]
-            centre[moved], spreads[moved], axes[moved] = _solve(rest)
-    left = np.bincount(group, kept, minlength=n).astype(np.int64)
-    return Planes(axes, spreads, centre, left, limit)
+    return Planes(axes, spreads, centre, np.bincount(group, kept, minlength=n).astype(np.int64), limit)
 
 
 def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -193,24 +166,6 @@ def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
-
-
-def _sum_moments(x: np.ndarray, group: np.ndarray, n: int) -> list[np.ndarray]:
-    """Number, sums (three) and sums of products (six) of each set, float64 (n,) each."""
-    sums: list[np.ndarray] = [np.bincount(group, minlength=n).astype(np.float64)]
-    sums += [np.bincount(group, x[axis], minlength=n) for axis in range(3)]
-    return sums + [np.bincount(group, x[a] * x[b], minlength=n) for a, b in _PRODUCTS]
-
-
-def _solve(moments: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre, spreads and axes of sets from their moments."""
-    number = np.maximum(moments[0], 1.0)
-    centre = np.stack([total / number for total in moments[1:4]], axis=1)
-    covariance = np.empty((len(number), 3, 3))
-    for (a, b), total in zip(_PRODUCTS, moments[4:], strict=True):
-        covariance[:, a, b] = covariance[:, b, a] = total / number - centre[:, a] * centre[:, b]
-    spreads, axes = np.linalg.eigh(covariance)
-    return centre, spreads, axes
 
 
 DIRECTIONS = 24

@@ -413,11 +413,13 @@ def measure_covariance(
     pairs: list[float] = []
     # In fewer waveforms than `measure_recovery` needs a tail of echoes looks like slow noise.
     most = MOST_LAGS if signal.shape[1] >= 2 * LEAST_WAVEFORMS else lags
-    for lag in range(1, min(most, len(signal) - 1) + 1):
+    last = min(most, len(signal) - 1)
+    found = _pair_differences(alone, marks, 1, min(lags, last))
+    for lag in range(1, last + 1):
         # Slow noise: a variogram is higher at each of its last lags than at those before.
         if lag > lags and not (min(half[-RISE:]) > max(half[-2 * RISE : -RISE])):
             break
-        number, square = _pair_differences(alone, marks, lag)
+        number, square = found[lag - 1] if lag <= lags else _pair_differences(alone, marks, lag, lag)[0]
         if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
             break
         half.append(0.5 * square / number)
@@ -436,20 +438,19 @@ def measure_covariance(
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
 
 
-def _pair_differences(quiet: np.ndarray, marks: np.ndarray | None, lag: int) -> tuple[float, float]:
-    """Pairs of samples `lag` apart and the sum of their squared differences.
+def _pair_differences(quiet: np.ndarray, marks: np.ndarray | None, lag: int, last: int) -> list[list[float]]:
+    """Pairs of samples `lag` to `last` apart and the sum of their squared differences, for each of these lags.
 
     quiet: float32 (s, n), the quiet samples; NaN for others. marks: uint8 (s, n), 1 and 2 by the masks of `mirrored`.
     """
-    found = np.zeros((4, 2))
+    found = np.zeros((max(last - lag + 1, 0), 4, 2))
     given = ctypes.c_void_p(None) if marks is None else marks
-    call("pair_differences", *map(ctypes.c_int64, quiet.shape), quiet, given, ctypes.c_int64(lag), found)
-    every, high, low, both = found
-    if marks is None:
-        return float(every[0]), float(every[1])
-    noise = min((low[0] - both[0]) / max(high[0] - both[0], 1.0), 1.0)
-    number, square = every + low - high - (1 - noise) * both
-    return float(number), float(square)
+    call("pair_differences", *map(ctypes.c_int64, quiet.shape), quiet, given, *map(ctypes.c_int64, (lag, last)), found)
+    every, high, low, both = found.transpose(1, 0, 2)
+    if marks is not None:
+        noise = np.minimum((low[:, :1] - both[:, :1]) / np.maximum(high[:, :1] - both[:, :1], 1.0), 1.0)
+        every = every + low - high - (1 - noise) * both
+    return every.tolist()
 
 
 def _extend(
@@ -728,10 +729,9 @@ def coloured_variance(rows: np.ndarray, correlation: tuple[float, ...] | np.ndar
     -------
     float64 (r,)
     """
-    found = np.einsum("rs,rs->r", rows, rows)
-    for lag, rho in enumerate(correlation[: rows.shape[1] - 1], 1):
-        if rho:
-            found += 2 * rho * np.einsum("rs,rs->r", rows[:, lag:], rows[:, :-lag])
+    weights, rho = np.ascontiguousarray(rows, np.float64), np.ascontiguousarray(correlation, np.float64)
+    found = np.empty(len(weights))
+    call("coloured_variance", *map(ctypes.c_int64, weights.shape), weights, ctypes.c_int64(len(rho)), rho, found)
     return found
 
 
