@@ -196,10 +196,12 @@ FILES = [
     # A wrong option is named before outputs that exist.
     ("run strip.las -o . --profile fast --where foo>1", 2, "there is no column 'foo'", {"strip.laz": "old"}),
     *((f"{CALIBRATE} t.csv", 2, f"t.csv: .. {words}", {"t.csv": text}) for text, words in (
+        ("reflectance,x,y,radius\n0.2,1,2,-4\n", "target 1: the outline needs three corners, or a radius above 0"),
+        ("reflectance,x,y,radius\n20,1,2,4\n", "reflectance must lie in 1e-06 to 1.5, not in per cent; it is 20"),
+        ("reflectance;x;y;radius\n0,2;1;2;4\n", "it has reflectance;x;y;radius; a target .. CSV has commas between"),
         ("name,x\n", "no target in it"), ("reflectance,x,y\n0.2,1,2\n", "target 1: radius is missing"),
         ("x,y,radius\n1,2,3\n", "target 1: reflectance is missing"),
         ("reflectance,x,y,radius\nhalf,1,2,3\n", "target 1: not numbers"),
-        ("reflectance,x,y,radius\n20,1,2,3\n", "must lie in 0 to 1.5"),
         ("reflectance,x,y,radius,incidence\n0.2,1,2,3,89\n", "incidence must lie in 0 to 85"),
         ("reflectance,vertices\n0.2,1 2 3\n", "target 1: not numbers"), ('{"features": 3}', "not GeoJSON"),
         (_polygon(1, 2, kind="Point"), "is a Point"), ("{", "not GeoJSON"))),

@@ -239,7 +239,7 @@ def load_targets(path: Path | str) -> list[Target]:
 
 
 def _read_target(row: Mapping[str, Any], where: str) -> Target:
-    fields = {str(key).strip().lower(): value for key, value in row.items() if value not in (None, "")}
+    fields = {str(key).strip().lower(): value for key, value in row.items() if key and value not in (None, "")}
     try:
         reflectance = float(fields["reflectance"])
         incidence = float(fields["incidence"]) if "incidence" in fields else None
@@ -249,16 +249,19 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
             angle = np.arange(_CORNERS) * (2 * np.pi / _CORNERS)
             circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
             with np.errstate(invalid="ignore", over="ignore"):
-                corners = float(fields["radius"]) * circle + [float(fields["x"]), float(fields["y"])]
+                radius = float(fields["radius"])
+                corners = radius * circle[: _CORNERS * (radius > 0)] + [float(fields["x"]), float(fields["y"])]
     except KeyError as error:
-        raise ConfigError(
-            f"{where}: {error.args[0]} is missing; a target has reflectance, and x, y, radius or vertices"
-        ) from error
+        needed = f"{error.args[0]} is missing, it has {', '.join(fields) or 'nothing'}"
+        raise ConfigError(f"{where}: {needed}; a target has reflectance, and x, y, radius or vertices; CSV has commas "
+                          "between them") from error  # fmt: skip
     except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{where}: not numbers: {error}") from error
-    if not LEAST_REFLECTANCE <= reflectance <= 1.5 or len(corners) < 3 or not (np.abs(corners) <= FARTHEST).all():
-        limits = f"in 0 to 1.5 and above {LEAST_REFLECTANCE:g}"
-        raise ConfigError(f"{where}: reflectance must lie {limits}, and the outline needs three corners")
+    if not LEAST_REFLECTANCE <= reflectance <= 1.5:
+        limits = f"{LEAST_REFLECTANCE:g} to 1.5, not in per cent"
+        raise ConfigError(f"{where}: reflectance must lie in {limits}; it is {reflectance:g}")
+    if len(corners) < 3 or not (np.abs(corners) <= FARTHEST).all():
+        raise ConfigError(f"{where}: the outline needs three corners, or a radius above 0, and possible coordinates")
     if incidence is not None and not 0 <= incidence < 85:
         raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
     name = str(fields.get("name", where.rsplit(": ", 1)[-1]))
