@@ -145,6 +145,8 @@ def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
         ("echoes_in_doubt", 0.2, ("20 % of the echoes in doubt: the system pulse is a guess", "give --system")),
         # Packets that begin in their canopy: a fifth of their echoes depends on it, and none was in doubt.
         ("quiet", 0.0, ("found too few samples without signal: the noise is a guess", "--system")),
+        ("false_in_noise_share", 0.06, ("found that noise made 6 of 100 echoes: the noise is a guess", "level: draw")),
+        ("false_in_noise_share", 0.02, ()),
         ("baseline_dn", -1.5, ("most of the noise below count 0: the noise is a guess",)),
     ],
 )

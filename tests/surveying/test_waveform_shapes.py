@@ -178,6 +178,16 @@ def test_spikes_of_one_sample_are_no_echoes():
     assert found > 0.985 and true > 0.985
 
 
+def test_spikes_of_one_sample_are_no_echoes_of_a_narrow_pulse():
+    """Of 1.25 samples, whose neighbours in an echo are .73 of its peak: an eighth of the echoes were spikes."""
+    signal, rows, time, _ = render(bell, 15, n=1000, s=64, amplitude=(15, 120), width=1.25, second=0.4)
+    at = np.random.default_rng(15).random(signal.shape) < 0.004
+    signal += np.where(at, np.random.default_rng(16).uniform(10, 60, signal.shape), 0)
+    system, found, true = scores(digitize(signal, 15), rows, time)
+    assert system.defects.spikes == pytest.approx(0.25, rel=0.3)
+    assert found > 0.985 and true > 0.97
+
+
 @pytest.mark.parametrize("bits", [8, 12, 16])
 def test_valleys_between_strong_echoes_are_no_spikes(bits):
     """Strong pairs 0.5 to 8 sigma apart: their valleys are deep, and were filled; 13 % of a 16-bit strip's echoes."""
@@ -342,6 +352,15 @@ def test_errors_hold_in_coloured_noise_that_grows_with_the_signal(rho, gain):
     assert true > 0.995
 
 
+def test_photons_are_no_echoes():
+    """A hundred photons at the peak of 800 echoes: of fits by white noise too few stayed single to show the growth."""
+    signal, rows, time, _ = render(bell, 24, n=800, s=64, amplitude=(10, 120), width=1.3, second=0.3)
+    counts = BASE + 0.7 * np.random.default_rng(24).poisson(signal / 0.7)
+    system, echoes = decompose(digitize(counts - BASE, 24))
+    assert system.noise.gain == pytest.approx(0.7, rel=0.25) and not system.defects
+    assert compare(echoes, rows, time)[1] > 0.99
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.05, 0.3])
 def test_noise_that_grows_with_the_signal_makes_no_narrow_pulse(gain):
@@ -476,6 +495,23 @@ def test_close_pairs_of_one_distance_stay_two_where_the_pulse_does_not_change(nu
     system, echoes = decompose(digitize(signal, 4, noise=1.0))
     assert system.misfit < 0.005
     assert (echoes.count(1500)[:number] == 2).mean() > 0.75 and (echoes.count(1500)[number:] == 1).mean() > 0.99
+
+
+def test_rows_of_crops_are_no_tail_of_the_pulse():
+    """All echoes have another one 1.8 FWHM after them: a third of these were taken for what the pulse leaves there."""
+    signal, rows, time, height = render(bell, 8, n=500, s=100, amplitude=(25, 140), width=2.12)
+    gap = 2.12 * np.random.default_rng(8).normal(4.24, 0.24, (500, 1))
+    ratio = np.random.default_rng(9).uniform(0.25, 0.5, 500)
+    signal += (ratio * height)[:, None] * bell((np.arange(100) - time[:, None] - gap) / 2.12)
+    assert (decompose(digitize(signal, 8, noise=1.0))[1].count(500) == 2).mean() > 0.95
+
+
+def test_a_pulse_is_chosen_by_the_waveforms_that_hold_echoes():
+    """One in 100 does: all of them were in the twentieth that does not count, and any pulse was as good."""
+    signal, rows, time, _ = render(bell, 12, n=1500, s=80, amplitude=(30, 150))
+    signal[rows % 100 > 0] = 0
+    system, echoes = decompose(digitize(signal, 12))
+    assert system.sigma_ref == pytest.approx(2.0, rel=0.02) and 15 <= len(echoes) <= 17  # of noise, in 120,000 samples
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,8 @@ GUARD = 3.0
 LEAST_SPIKES = 0.003
 """Spikes per waveform from which they are taken off."""
 
-NARROWEST = 1.5
-"""Width of the system pulse [samples] from which a spike cannot be an echo."""
+NARROWEST = 1.2
+"""Width of the system pulse [samples] from which a spike cannot be an echo, whose neighbours are seven tenths of it."""
 
 PATTERN, CERTAIN = 0.05, 6.0
 """Offset of a pattern that matters [count, or noise of a sample], and its standard errors."""

@@ -46,9 +46,10 @@ from wavebatch.surveying.measuring.noise_and_width import (
     measure_once_more,
     measure_quiet,
     measure_whole,
+    thin_empty,
     thin_samples,
 )
-from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, measure_residuals
+from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, find_overgrown, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
@@ -211,6 +212,9 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
     if guessed:  # too few echoes stand alone to know how far signal reaches
         begin = measure_whole(block, begin)
     found = measure_defects(block, begin)
+    if found.defects.spikes and find_overgrown(block, begin, find_clear(block, begin)):
+        # Noise that grows so with the signal has samples of its own that stand out.
+        found = replace(found, defects=replace(found.defects, spikes=0.0))
     if not found.defects:
         return block, begin if guessed else measure_whole(block, begin)
     block = clean_block(block, found)
@@ -223,6 +227,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     candidates: tuple[Tried, ...] = ()
     if learn:
         clear = find_clear(block, system)
+        grown = 0.0 if system.noise.gain else find_overgrown(block, system, clear)
+        if grown:
+            return _survey(block, measure_again(block, first, grown), learn=learn)
         main = find_isolated(block, system, clear)
         figures.isolated_echoes = len(main)
         starts = {"gaussian": system}
@@ -234,7 +241,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
         # Where a Gaussian misses the lone echoes by less than noise shows, there is nothing to learn but its width.
         plain = len(block) >= SMALL and figures.misfit_gaussians.get(1, np.inf) <= (figures.misfit_goal or 0.0)
-        choice = choose_pulse(block, starts, list_known(block, system), plain=plain)
+        choice = choose_pulse(thin_empty(block, system), starts, list_known(block, system), plain=plain)
         # Starts of guessed widths are measured from nothing, and know no defects.
         system, candidates = replace(choice.best.system, defects=first.defects), choice.tried
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change

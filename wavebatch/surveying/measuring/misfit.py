@@ -218,7 +218,8 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
             is_part &= other.number >= ENOUGH_FOR_TAIL or not higher
         elif higher:  # most echoes have a neighbour there, perhaps all of them
             is_part = False
-        if is_part and share > min(LEAST_TAIL, 2 * left.noise):
+        # Higher ones are targets: rows of crops, and roofs over the ground, have one distance.
+        if is_part and PART > share > min(LEAST_TAIL, 2 * left.noise):
             profile.append((float(place * system.sigma_ref), float(share)))
     return replace(system, tail_misfit=tuple(profile))
 

@@ -49,6 +49,10 @@ adds a fifth to the echoes. What pulse such a strip has is decided by all of its
 HALVED = 120
 """Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
 
+SPARSE, LEAST_HELD, HOLDS = 4, 8, 6.0
+"""Empty waveforms for each with signal, at most, by which a pulse is chosen; with signal, fewer than which show no
+standard error; and height of what is signal [standard deviations], which noise reaches in one sample of 10^9."""
+
 ENOUGH_TO_LEARN = 20
 """Isolated echoes from which a pulse can be learned (R2): at SNR 20 their stack is known to a hundredth of its peak, a
 Gaussian misses the pulses of real sensors by two to six."""
@@ -177,6 +181,20 @@ def spread_rows(n: int, number: int) -> np.ndarray:
     """At most `number` of n rows, spread evenly."""
     number = min(number, n)
     return np.arange(number) * n // max(number, 1)
+
+
+def thin_empty(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
+    """The block with at most SPARSE empty waveforms for each one that holds signal.
+
+    What is the same in nineteen of twenty waveforms is a strip's pulse and misfit; where 99 of 100 are empty, no echo
+    would be among them.
+    """
+    level = system.noise.baseline + HOLDS * np.hypot(system.noise.std, system.noise.baseline_spread)
+    full = block.samples.max(axis=1) > level
+    held, empty = np.flatnonzero(full), np.flatnonzero(~full)
+    if len(held) < LEAST_HELD or len(empty) <= SPARSE * len(held):
+        return block
+    return block.rows(np.sort(np.r_[held, empty[spread_rows(len(empty), SPARSE * len(held))]]))
 
 
 def thin_samples(block: WaveformBlock, number: int) -> WaveformBlock:
