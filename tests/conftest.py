@@ -102,17 +102,23 @@ def wide_strip(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def edit_points() -> Callable[[Path, Path, Callable[[np.ndarray], np.ndarray]], Path]:
-    """`edit_points(source, target, change)`: a copy of a LAS file whose records are those that `change` makes."""
+def edit_points() -> Callable[..., Path]:
+    """`edit_points(source, target, change, **fields)`: a copy of a LAS file whose points have these fields.
+
+    change: alters the records it is given, or returns others.
+    """
     from wavebatch.files.las.header import STANDARD_DTYPES, read_header
 
-    def edit(source: Path, target: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
+    def edit(source: Path, target: Path, change: Callable[[np.ndarray], np.ndarray | None] | None = None, **fields):
         header = read_header(source)
         assert not header.compressed and header.point_length == STANDARD_DTYPES[header.point_format].itemsize
         content = bytearray(source.read_bytes())
         start, end = header.offset_to_points, header.offset_to_points + header.point_count * header.point_length
-        points = np.frombuffer(bytes(content[start:end]), STANDARD_DTYPES[header.point_format])
-        changed = change(points.copy())
+        points = np.frombuffer(bytes(content[start:end]), STANDARD_DTYPES[header.point_format]).copy()
+        for name, values in fields.items():
+            points[name] = values
+        changed = None if change is None else change(points)
+        changed = points if changed is None else changed
         assert changed.shape == points.shape and changed.dtype == points.dtype
         content[start:end] = changed.tobytes()
         target.write_bytes(content)

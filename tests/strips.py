@@ -163,9 +163,8 @@ def add_record(path: Path, record: Vlr) -> None:
 def take_turns(path: Path, edit_points: Callable) -> Path:
     """Gives the pulses one of two equal digitizers in turn: blocks have them in another order than the file."""
 
-    def change(points: np.ndarray) -> np.ndarray:
+    def change(points: np.ndarray) -> None:
         points["wavepacket_index"] *= 1 + np.unique(points["gps_time"], return_inverse=True)[1].astype(np.uint8) % 2
-        return points
 
     edit_points(path, path, change)
     (first,) = [vlr for vlr in read_header(path).vlrs if vlr.record_id == 100]

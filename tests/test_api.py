@@ -206,11 +206,7 @@ def test_waveforms_of_arrays_are_surveyed_and_decomposed(rng):
 
 
 def test_a_strip_without_waveforms_cannot_be_surveyed(strips, tmp_path, edit_points):
-    def strip_off(points):
-        points["wavepacket_index"] = 0
-        return points
-
-    bare = edit_points(strips[0], tmp_path / "bare.las", strip_off)
+    bare = edit_points(strips[0], tmp_path / "bare.las", wavepacket_index=0)
     refuses(wb.InputError, "holds no waveform", wb.survey, bare)
 
 

@@ -52,7 +52,6 @@ def test_fits_that_fail_far_more_than_usual_are_said_with_quiet_too(leica, tiny_
 def test_return_locations_that_are_not_those_of_echoes_are_doubted(tiny_strip, tmp_path, edit_points, factor):
     def change(points):
         points["return_point_wave_location"] *= factor
-        return points
 
     (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "bad.las", change), tmp_path)
     assert "returns lie where their packet has an echo: the return locations" in line and "picoseconds" in line
@@ -67,12 +66,8 @@ def test_packets_of_another_strip_warn_in_cron_too(riegl, tmp_path):
 
 
 def test_locations_that_fit_no_echo_warn_in_cron_too(tmp_path, edit_points):
-    def forget(points):
-        points["return_point_wave_location"] = 0
-        return points
-
     source = data_file("lvis/lvis1.las")
-    strip = edit_points(source, tmp_path / "zero.las", forget)
+    strip = edit_points(source, tmp_path / "zero.las", return_point_wave_location=0)
     shutil.copy(source.with_suffix(".wdp"), strip.with_suffix(".wdp"))
     lines = warn_quietly(strip, tmp_path)
     text = "returns lie where their packet has an echo: zero.wdp belongs to another strip, or"
@@ -102,18 +97,13 @@ def test_a_strip_without_any_echo_or_waveform_warns_in_cron_too(tiny_strip, tmp_
     (line,) = warn_quietly(constant, tmp_path / "flat")
     assert "holds an echo: nothing rises" in line
 
-    def remove(points):
-        points["wavepacket_index"] = 0
-        return points
-
-    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "bare.las", remove), tmp_path / "bare")
+    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "bare.las", wavepacket_index=0), tmp_path / "bare")
     assert "none of " in line and "points has a waveform" in line
 
 
 def test_points_whose_packets_are_lost_warn_in_cron_too(tiny_strip, tmp_path, edit_points):
     def break_some(points):
         points["wavepacket_offset"][::3] = 1 << 40
-        return points
 
     (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "cut.las", break_some), tmp_path, code=3)
     assert "with a packet past the end of the waveform data" in line

@@ -338,7 +338,6 @@ def test_own_packets_of_the_weakest_returns_alone_are_not_refused(strips, tmp_pa
         weakest = order[np.unique(points["wavepacket_offset"][order], return_index=True)[1]]
         others = np.setdiff1d(np.arange(len(points)), weakest)
         points["wavepacket_index"][others] = points["wavepacket_size"][others] = 0
-        return points
 
     for name in ("forest", "canopy.gemini-24"):
         strip = edit_points(strips[name], tmp_path / f"{name}.las", weaken)
@@ -349,7 +348,6 @@ def test_own_packets_of_the_weakest_returns_alone_are_not_refused(strips, tmp_pa
 def test_few_packets_prove_nothing(strips, tmp_path, edit_points):
     def keep_few(points):
         points["wavepacket_size"][40:] = 0
-        return points
 
     strip = edit_points(strips["forest"], tmp_path / "few.las", keep_few)
     shutil.copy(strips["urban"].with_suffix(".wdp"), strip.with_suffix(".wdp"))

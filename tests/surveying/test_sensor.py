@@ -374,7 +374,6 @@ def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_pa
 def test_a_digitizer_whose_vectors_contradict_a_trajectory_is_named(tmp_path, edit_points):
     def turn(points):
         points["x_t"][points["wavepacket_index"] == 3] += 1.5e-5
-        return points
 
     flight = Sensor(rate=5000.0, n_samples=40, gains={1: 1.0, 3: 1.0})
     trajectory = facet_strips.write_trajectory(tmp_path / "t.csv", flight, 2.0)
@@ -571,11 +570,7 @@ def test_few_windows_assume_what_an_aircraft_does_in_turbulent_air():
 def test_a_trajectory_is_of_no_use_to_points_without_times(tmp_path, tiny_strip, edit_points, time):
     """The advice was to give --trajectory, which was given."""
 
-    def stop_clock(points):
-        points["gps_time"] = time
-        return points
-
-    strip = edit_points(tiny_strip, tmp_path / "still.las", stop_clock)
+    strip = edit_points(tiny_strip, tmp_path / "still.las", gps_time=time)
     with pytest.raises(InputError, match="no GPS times, or all the same; give --flight-height instead"):
         find(strip, trajectory=write_trajectory(tmp_path / "t.csv"))
     assert find(strip, height=800.0).kind == "flight height"

@@ -169,7 +169,6 @@ def two_channels(tmp_path_factory, edit_points):
         second = (points["wavepacket_offset"] // length % 3 == 0) & (points["wavepacket_index"] > 0)
         points["wavepacket_index"][second] = 2
         weak.update(points["wavepacket_offset"][second].tolist())
-        return points
 
     edit_points(path, copy, change)
     content = bytearray(copy.read_bytes())

@@ -342,7 +342,6 @@ def test_packets_of_one_pulse_are_one_pulse(tmp_path, edit_points):
         points["wavepacket_offset"][late] += 40
         points["return_point_wave_location"][late] -= 40_000
         points["wavepacket_size"] = np.minimum(points["wavepacket_size"], 40)
-        return points
 
     cut = edit_points(whole, tmp_path / "cut.las", halve)
     content, old = cut.read_bytes(), struct.pack("<BBII", 8, 0, 80, 1000)

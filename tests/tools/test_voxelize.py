@@ -487,7 +487,6 @@ def test_rays_far_from_all_others_are_counted_and_left_out(forest, tmp_path, edi
     def throw(points):
         points["X"][:40] = 2_147_000_000
         points["Z"][40:60] = -2_147_000_000
-        return points
 
     bent = edit_points(strip, tmp_path / "bent.las", throw)
     summary, found = voxelize(bent, tmp_path / "v.npz", 0.2)
@@ -842,7 +841,6 @@ def test_returns_that_are_missing_or_stand_far_apart_are_named(strips, canopy, e
     def number(points):
         _, first, pulse = np.unique(points["gps_time"], return_index=True, return_inverse=True)
         points["bit_fields"] = np.arange(len(points)) - first[pulse] + 1 | totals[pulse] << 3
-        return points
 
     def sort(points):
         return points[np.argsort(points["bit_fields"] & 7, kind="stable")]
