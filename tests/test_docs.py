@@ -1,5 +1,7 @@
-"""The documentation: its examples run, what it names exists, every stage and column is in it; the wheel is whole."""
+"""Documentation: what it shows is true, its sentences are held by tests, and the site is whole."""
 
+import ast
+import functools
 import importlib.metadata
 import importlib.util
 import os
@@ -14,6 +16,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+import wavebatch
 from wavebatch.cli import COMMANDS, main
 from wavebatch.core.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
 from wavebatch.kernels.build_kernels import LIBRARY
@@ -208,3 +211,103 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     # Nothing is loaded from another host.
     loaded = re.findall(r'<(?:script|link|img)\b[^>]*?(?:src|href)="((?:https?:)?//[^"]+)"', "".join(pages.values()))
     assert loaded == []
+
+
+TEXT = (ROOT / "README.md").read_text("utf-8")
+
+
+def test_it_is_short():
+    assert len(TEXT.splitlines()) <= 250
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_every_command_is_described(name):
+    assert f"| `wavebatch {name}` |" in TEXT
+
+
+def test_profiles_are_named():
+    for name in (*list_profiles(), "auto"):
+        assert f"`{name}`" in TEXT
+
+
+def test_the_first_commands_are_two_targets_of_the_makefile():
+    block = re.search(r"## Try it\n\n((?:    .*\n)+)", TEXT).group(1)
+    commands = [line.split("#")[0].split() for line in block.splitlines()]
+    assert commands == [["make", "demo"], ["make", "test"]]
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    for target in re.findall(r"`?make ([a-z]+)", TEXT):
+        assert re.search(rf"(?m)^{target}:", makefile), target
+
+
+def test_the_python_example_uses_public_names():
+    names = set(re.findall(r"\bwb\.(\w+)", TEXT))
+    assert len(names) > 4 and names <= set(wavebatch.__all__)
+
+
+def test_versions_agree():
+    for name in ("CITATION.cff", "CHANGELOG.md"):
+        assert wavebatch.__version__ in (ROOT / name).read_text("utf-8")
+
+
+HELD = ROOT / "tests" / "reliability_tests.txt"
+
+
+def split_sentences(text):
+    """The sentences of a Markdown text, each on one line; rows of a table and items of a list are split too."""
+    text = re.sub(r"```.*?```|(?m:^    [^\n]*$)", "", text, flags=re.DOTALL)
+    found = []
+    for block in re.split(r"\n\s*\n|\n(?=- |\|)", text):
+        line = " ".join(block.split())
+        if line and not line.startswith("#") and not set(line) <= set("|- "):
+            found += re.split(r"(?<=[.])\s+(?=[A-Z`*-])", line.removeprefix("- "))
+    return found
+
+
+def read_held():
+    """The tests of each sentence."""
+    held = {}
+    for line in HELD.read_text("utf-8").splitlines():
+        if line.startswith("    "):
+            held[sentence].append(line.strip())  # noqa: F821 - of the line before
+        elif line and not line.startswith("#"):
+            sentence = line
+            assert sentence not in held, sentence
+            held[sentence] = []
+    return held
+
+
+def test_every_sentence_of_what_can_be_relied_on_has_its_tests():
+    sentences = split_sentences((ROOT / "docs" / "reliability.md").read_text("utf-8"))
+    held = read_held()
+    missing = [sentence for sentence in sentences if sentence not in held]
+    assert not missing, f"no test is named for {missing}; add the sentence and its tests to {HELD.name}"
+    gone = [sentence for sentence in held if sentence not in sentences]
+    assert not gone, f"no sentence of the document any more: {gone}"
+    assert all(held.values()), [sentence for sentence, tests in held.items() if not tests]
+
+
+@functools.cache
+def _tree(path):
+    return ast.parse(path.read_text("utf-8"))
+
+
+def test_the_named_tests_exist_and_assert_something():
+    for sentence, tests in read_held().items():
+        for test in tests:
+            if test.startswith("fact: "):
+                continue
+            path, _, name = test.partition("::")
+            tree = _tree(ROOT / path)
+            found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
+            found = [node for node in found if not name or node.name == name]
+            assert found, f"{test}, which should hold {sentence!r}, is not there"
+            for node in found:
+                helpers = {one.name for one in tree.body if isinstance(one, ast.FunctionDef) and _asserts(one)}
+                calls = {ast.unparse(one.func) for one in ast.walk(node) if isinstance(one, ast.Call)}
+                assert _asserts(node) or calls & {"pytest.raises", *helpers}, f"{test} asserts nothing"
+                marks = " ".join(map(ast.unparse, node.decorator_list))
+                assert "mark.skip(" not in marks and "xfail" not in marks, f"{test} does not run"
+
+
+def _asserts(node):
+    return any(isinstance(one, ast.Assert) for one in ast.walk(node))

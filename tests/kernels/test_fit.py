@@ -1,4 +1,4 @@
-"""The compiled fit against scipy on the same windows: free, at bounds, clipped, with gaps and with a prior."""
+"""Fits of sums of pulses against SciPy; their errors against the bounds and the closed forms."""
 
 import naive
 import naive_fit
@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from fits import TIGHT, decompose, fit
 
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.closed_form import crlb, fit_closed_form
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.stages.decompose.fit import closed_form
+from wavebatch.tools.bench.accuracy import find_bounds
+from wavebatch.tools.simulate import PulseModel, Recording
 
 LENGTH = 32
 SHAPES = {
@@ -298,3 +304,130 @@ def test_undamped_steps_lead_to_the_least_squares(rng):
     box = np.array([[0.0], [0.0], [0.5]]), np.array([[1e3], [40.0], [9.0]])
     plain = np.stack([naive.fit(y[i], np.arange(40.0), 1.0, start[i], *box)[0] for i in range(6)])
     np.testing.assert_allclose(found.parameters[:, :3], plain, atol=2e-3)
+
+
+def numeric_bounds(parameters, noise_std, spacing, n_samples):
+    """Naive twin: derivatives by central differences, Fisher matrix and its inverse, one waveform."""
+    x = np.arange(n_samples) * spacing
+
+    def model(p):
+        return sum(a * np.exp(-0.5 * ((x - t) / s) ** 2) for t, a, s in p.reshape(-1, 3))
+
+    start = np.array(parameters, float).ravel()
+    columns = []
+    for i in range(len(start)):
+        step = np.zeros(len(start))
+        step[i] = 1e-6 * max(abs(start[i]), 1.0)
+        columns.append((model(start + step) - model(start - step)) / (2 * step[i]))
+    jacobian = np.array(columns).T
+    covariance = np.linalg.inv(jacobian.T @ jacobian) * noise_std**2
+    return np.sqrt(np.diag(covariance)).reshape(-1, 3), covariance
+
+
+@pytest.mark.parametrize(
+    ("sigma", "spacing", "tolerance"),
+    [(1.5, 1.0, 1e-3), (2.0, 1.0, 1e-3), (4.0, 2.0, 1e-3), (1.0, 1.0, 1e-2), (0.5, 0.25, 1e-3)],
+)
+@pytest.mark.parametrize("phase", [0.0, 0.21, 0.5])
+def test_closed_forms_equal_the_fisher_matrix(sigma, spacing, tolerance, phase):
+    time = (30 + phase) * spacing
+    (expected,), covariance = numeric_bounds([(time, 50.0, sigma)], 1.3, spacing, 64)
+    found = crlb(np.array(50.0), np.array(sigma), 1.3, spacing)
+    assert np.allclose(np.array(found), expected, rtol=tolerance)
+    if tolerance < 1e-2:
+        correlation = covariance[1, 2] / np.sqrt(covariance[1, 1] * covariance[2, 2])
+        assert correlation == pytest.approx(-1 / np.sqrt(3), abs=2e-3)
+
+
+def test_constants_of_the_specification():
+    time, amplitude, sigma = crlb(np.array([20.0]), np.array([1.7]), 1.0, 1.0)
+    assert time == pytest.approx(1.0623 / 20 * np.sqrt(1.7), rel=1e-4)
+    assert sigma == pytest.approx(time)
+    assert amplitude == pytest.approx(0.9199 / np.sqrt(1.7), rel=1e-4)
+    assert time * 14.9896 == pytest.approx(1.04, abs=0.005)
+
+
+def test_bounds_broadcast_noise_per_echo():
+    noise = np.array([1.0, 2.0])
+    time, amplitude, sigma = crlb(np.array([50.0, 50.0]), np.array([2.0, 2.0]), noise, 1.0)
+    assert time[1] == pytest.approx(2 * time[0])
+    assert amplitude[1] == pytest.approx(2 * amplitude[0])
+    assert sigma.shape == (2,)
+
+
+def inflate(time, amplitude):
+    """Bounds of echoes of width 2 in one waveform over those of each alone in the middle of one, (k, 3)."""
+    k = len(time)
+    waveform, place = np.r_[np.zeros(k), 1 + np.arange(k)], np.r_[time, np.full(k, 40.3)]
+    truth = EchoTable.build(waveform, place, np.tile(amplitude, 2), np.full(2 * k, 2.0))
+    found = find_bounds(Recording(n_samples=80, pulse=PulseModel(2.0)), truth, k + 1)
+    return found[:k] / found[k:]
+
+
+@pytest.mark.parametrize(
+    ("gap", "expected"),
+    [
+        (1.0, (129, 272, 23.6)),
+        (1.5, (24.8, 30.5, 7.7)),
+        (2.0, (7.6, 5.6, 3.7)),
+        (3.0, (1.63, 1.02, 1.57)),
+        (4.0, (1.04, 1.01, 1.10)),
+    ],
+)
+def test_two_echoes_inflate_as_the_specification_says(gap, expected):
+    for factors in inflate([30.0, 30.0 + 2.0 * gap], [80.0, 40.0]):
+        assert factors == pytest.approx(expected, rel=0.04)
+
+
+def test_truncated_echoes_follow_the_edge_table():
+    for inside, expected in ((2, (1.00, 1.01, 1.02)), (1, (1.19, 1.04, 1.34)), (0, (4.6, 1.5, 3.3))):
+        # The table counts the edge half a sample outside the first one or at it: allow for that at the very edge.
+        assert inflate([inside * 2.0], [50.0])[0] == pytest.approx(expected, rel=0.35 if inside == 0 else 0.08)
+
+
+VECTOR = 37.5 * np.exp(-0.5 * ((np.arange(31) - 14.3) / 1.8) ** 2)
+PEAK = 14
+
+
+def windows(y, reach=12):
+    return y[None, PEAK - reach : PEAK + reach + 1]
+
+
+def test_a_gaussian_is_found_exactly():
+    amplitude, time, width, holds = fit_closed_form(windows(VECTOR), 0.2)
+    assert holds.all()
+    assert amplitude[0] == pytest.approx(37.5, rel=1e-12)
+    assert time[0] + PEAK == pytest.approx(14.3, rel=1e-12)
+    assert width[0] == pytest.approx(1.8, rel=1e-12)
+
+
+def test_rounded_gaussian_gives_the_published_numbers():
+    amplitude, time, width, _ = fit_closed_form(windows(np.rint(VECTOR)), 0.2)
+    assert amplitude[0] == pytest.approx(37.6073, abs=5e-5)
+    assert time[0] + PEAK == pytest.approx(14.28882, abs=5e-6)
+    assert width[0] == pytest.approx(1.80415, abs=5e-6)
+
+
+@pytest.mark.parametrize(("steps", "tolerance"), [(2, 2e-5), (30, 1e-5)])
+def test_steps_lead_to_the_published_least_squares(steps, tolerance):
+    """Two Gauss-Newton steps after the closed form, and the minimum itself."""
+    block = WaveformBlock.from_samples(np.rint(VECTOR)[None].astype(np.uint8))
+    noise = Noise(np.zeros(1, np.float32), np.full(1, 0.3, np.float32))
+    start = EchoTable.build([0], [14.0], [37.0], [2.0])
+    # A wide system pulse makes the window cover all samples.
+    echoes = closed_form(block, noise, SystemPulse(2.4, noise=ReceiverNoise(std=0.3)), start, steps=steps)
+    assert echoes.amplitude[0] == pytest.approx(37.62496, abs=5 * tolerance)
+    assert echoes.time[0] == pytest.approx(14.294543, abs=tolerance)
+    assert echoes.sigma[0] == pytest.approx(1.802284, abs=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("fraction", "third", "low", "high"), [(0.1, 20, 2, 7), (0.2, 20, 2, 6), (0.5, 20, 3, 6), (0.5, 30, 2, 6)]
+)
+def test_only_samples_around_the_peak_that_are_high_enough_count(fraction, third, low, high):
+    """Not those behind a lower one, however high: a plain weighted parabola through the logarithms of the others."""
+    y = np.array([50.0, 3, third, 45, 60, 40, 10, 2, 55])
+    c2, c1, c0 = np.polyfit(np.arange(low - 4, high - 4), np.log(y[low:high]), 2, w=y[low:high])
+    expected = np.exp(c0 - c1 * c1 / (4 * c2)), -c1 / (2 * c2), np.sqrt(-1 / (2 * c2))
+    *found, holds = fit_closed_form(y[None], fraction)
+    assert holds.all() and np.concatenate(found) == pytest.approx(np.array(expected), rel=1e-7)

@@ -2,7 +2,7 @@
 
 `survey` takes one where a strip has too few echoes to learn a pulse from; `wavebatch survey` names the one that a
 strip's pulse looks like. Before you change it: a wrong pulse is worse than none, so the margins must keep simulated
-strips of other sensors from getting one (tests/surveying/test_known_systems.py).
+strips of other sensors from getting one (tests/surveying/test_survey.py).
 
 `doubt_survey` says for `survey` and `run` whether pulse or noise of a survey are a guess.
 """
