@@ -33,7 +33,7 @@ COMPILED = {
     "number_returns": ("number_returns", "naive_geometry.number_returns"),
     "share_offsets": ("share_offsets", "test_group_returns._offset_by_loop"),
     "measure_lobes": ("measure_pulse", "naive_fit.measure"),
-    "find_two_lines": ("in_two_lines", "test_two_lines.on_two_lines"),
+    "find_two_lines": ("in_two_lines", "test_hough.on_two_lines"),
     "trim_planes": ("fit_planes", "test_planes.naive_plane"),
     "coloured_variance": ("colour_factors", "naive_signal.colour_factors"),
     "find_around": ("Surroundings", "test_planes._neighbours_by_loop"),
