@@ -244,7 +244,7 @@ def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
         (lambda path: "shot_enrgy", "no extra byte and no file is called 'shot_enrgy'; did you mean 'shot_energy'"),
         (lambda path: write(path, "time,power\n1,2\n"), "first line must name the columns time and energy"),
         (lambda path: write(path, "time,energy\n1,2\n2,x\n"), "a row has no number for time or energy"),
-        (lambda path: write(path, "time,energy\n1,2\n2,3\n"), "knows 0 of 6000 pulses of the strip"),
+        (lambda path: write(path, "Time [s],Energy [uJ]\n1,2\n2,3\n"), "knows 0 of 6000 pulses of the strip"),
     ],
 )
 def test_energies_that_cannot_be_used_are_refused_in_one_line(tmp_path, flickering, make, message):

@@ -169,7 +169,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
             raise InputError(f"{path}: --energy: no extra byte and no file is called {name!r}; {hint}")
         lines = read_text(name, "file of pulse energies", 1 << 30).splitlines()
         rows = [line.replace(",", " ").replace(";", " ").split() for line in lines if line.strip()]
-        header = [word.casefold() for word in rows[0]] if rows else []
+        header = [word.casefold() for word in rows[0] if word[0] not in "[("] if rows else []  # units, as in time [s]
         if not {"time", "energy"} <= set(header):
             words = "its first line must name the columns time and energy"
             raise InputError(f"{name}: {words}; it is {' '.join(header)!r}")
