@@ -27,11 +27,8 @@ from wavebatch.tools.sheets.sheet import list_lines
                     text="Targets: GeoJSON polygons with the property reflectance, in WGS 84, in the CRS that the file "
                     "names, or in the coordinates of the strips; or CSV with reflectance and x, y, radius or vertices, "
                     "in the coordinates of the strips only.")
-@shared.options_of(CalibrationOptions, "column")
 @shared.output_option("Calibration file to write.", "CAL.toml")
-@shared.options_of(
-    CalibrationOptions, "reflectance_error", "attenuation", "wavelength", "divergence", "scan_angle"
-)
+@shared.options_of(CalibrationOptions)
 @shared.output_option("Also write constants, drifts and overlaps of the strips as JSON.", "FILE", "--report",
                       required=False)
 @shared.chain_options

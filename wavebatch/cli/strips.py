@@ -211,10 +211,8 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
 @click.command()
 @click.argument("cloud", type=shared.INPUT)
 @_output
-@shared.options_of(SynthesisOptions, "intensity", "gain", "width", "widths", "shares", "spacing", "bits", "baseline",
-                   "noise")
+@shared.options_of(SynthesisOptions)
 @shared.seed_option("Seed of the noise and of the first sample's time.")
-@shared.options_of(SynthesisOptions, "internal")
 @shared.options_of(Radar, default=None)
 @shared.common_options("overwrite", "json")
 def synthesize(cloud: Path, output: Path, **options: Any) -> None:
