@@ -57,7 +57,7 @@ def test_all_models_and_options_are_fitted(plain):
 
 @on_x86
 @pytest.mark.parametrize(
-    "flags", [["-mavx2", "-mfma"], ["-march=x86-64-v4"], ["-O0"], ["-O2"], ["-DONLY_FOUR"]], ids=" ".join
+    "flags", [["-mavx2", "-mfma"], ["-march=x86-64-v4"], ["-O0"], ["-O2"], ["-DWIDEST=4"], ["-DWIDEST=8"]], ids=" ".join
 )
 def test_instructions_and_optimisation_do_not_change_a_bit(plain, tmp_path, flags):
     if flags == ["-march=x86-64-v4"] and not has(("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")):
@@ -114,8 +114,8 @@ def test_no_memory_is_misused_or_left(plain, tmp_path):
 
 @on_x86
 def test_functions_for_four_doubles_have_the_bits_of_two(tmp_path):
-    """`OFFER` in kernels/c/pulse.h compiles them for AVX2 too; -DONLY_FOUR leaves that out."""
-    compile_library(tmp_path / "four.so", ("-DONLY_FOUR",))
+    """`OFFER` in kernels/c/pulse.h compiles them for AVX2 too; -DWIDEST=4 leaves that out."""
+    compile_library(tmp_path / "four.so", ("-DWIDEST=4",))
     four, rng = ctypes.CDLL(str(tmp_path / "four.so")), np.random.default_rng(7)
     for x in (rng.uniform(-750, 710, 10_003), rng.normal(0, 3, 1001), np.array([np.nan, np.inf, -np.inf, 0.0, 5e-324])):
         for name, values in (("exponentials", x), ("logarithms", x), ("logarithms", abs(x))):

@@ -15,7 +15,7 @@ static const double UNDETERMINED = 1e30;       /* pivot of an unknown that the d
 static const int MOST_IDLE = 2;                /* iterations with an echo of no amplitude, whose time then drifts: it is
                                                   left out before the others are fitted on (decompose.h) */
 static const int CENSORED = 100;               /* least iterations with clipped samples: starts are far off (H6) */
-static const int64_t LONG = 32;                /* vectors of a window in which waiting for sums costs more than a call */
+static const int64_t LONG = 12;                /* vectors of a window in which waiting for sums costs more than a call */
 
 static const double LEAST_AWAY = 0.25;         /* of a peak from a log-normal's origin, where the pulse has no width */
 static const double LEAST_WIDTH = 0.1;         /* below it a fit without damping is lost: the echo lies on one sample */

@@ -1,7 +1,8 @@
 /* A Gaussian, further ones added to it, and derivatives: a ROW of samples at a time.
 
-   pulse.h includes this file for rows of four samples and again for rows of eight: sums of learned pulses are half of the
-   time of their fits. A sample goes through the same operations in the same order in both, so the bits are the same. */
+   pulse.h includes this file for rows of four samples and again for rows of eight and of sixteen: sums of learned pulses
+   are half of the time of their fits. A sample goes through the same operations in the same order in all of them, so the
+   bits are the same. */
 
 /* e^a for a <= 0, error 1e-7 of the value; 0 below e^-40: nothing that small changes a fit, and squares of still smaller
    numbers make processors slow. e^a = 2^n e^r with |r| <= ln(2) / 2; the series in r is a Chebyshev fit. */
