@@ -345,6 +345,10 @@ def test_a_changed_survey_is_not_trusted_in_silence(strips, tmp_path):
     path.write_text(text.split("[figures]")[0])
     broken = fly(strips["a"], "-o", tmp_path, "--survey", "flight", "--resume")
     assert broken.exit_code == 2 and "holds no survey of a flight" in broken.stderr and broken.stderr.count("\n") == 1
+    path.write_text(text[:500])
+    cut = fly(strips["a"], "-o", tmp_path, "--survey", "flight", "--resume")
+    assert cut.exit_code == 2 and cut.stderr.startswith(f"error: {path}: not valid TOML: ")
+    assert cut.stderr.endswith("; remove it: then the strips are surveyed again\n")
     again = fly(strips["a"], strips["b"], "-o", tmp_path, "--survey", "flight", "--overwrite")
     assert again.exit_code == 0 and path.read_text() == text
 

@@ -418,11 +418,12 @@ def load_flight(jobs: Sequence[StripJob], options: RunOptions) -> SavedSurvey | 
     path = options.folder / FLIGHT_FILE
     if options.overwrite or not any(job.request.flight for job in jobs) or not os.path.lexists(path):
         return None
-    saved = load_survey(path)
     try:
+        saved = load_survey(path)
         read_flight(saved.survey)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        words = str(error).removeprefix(f"{path}: ")
+        raise ConfigError(f"{path}: {words}; remove it: then the strips are surveyed again") from error
     return saved
 
 

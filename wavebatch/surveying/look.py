@@ -261,7 +261,7 @@ def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
     """Return what a surveyed flight records, and its descriptors; raises ConfigError for a survey of no flight."""
     look, kinds = survey.figures.look, survey.figures.kinds
     if look is None or not kinds:
-        raise ConfigError("holds no survey of a flight; `wavebatch run --survey flight --overwrite` makes one")
+        raise ConfigError("holds no survey of a flight")
     return look, dict(sorted(kinds.items()))
 
 
