@@ -302,6 +302,18 @@ def test_fewer_echoes_that_lose_for_want_of_waveforms_are_a_doubt(answered, doub
     assert choice.best is (short if doubted else wide) and choice.doubt == pytest.approx(0.5 if doubted else 1.0)
 
 
+@pytest.mark.parametrize(("errors", "small", "doubt"), [(6, True, 0.1), (6, False, 0.0), (8, True, 0.0)])
+def test_a_pulse_looks_too_good_to_the_waveforms_that_taught_it(errors, small, doubt):
+    """One that needs a tenth fewer echoes loses by so many standard errors."""
+    spread = 0.5 * np.resize([1.0, -1.0], 400)
+    learned, other = (
+        choose_pulse.Candidate("", SystemPulse(2.0), 0.0, 50 + more, echoes, 100, False, 1, 0.0)
+        for more, echoes in ((0 * spread, 100), (errors * 0.5 / np.sqrt(400) + spread, 90))
+    )
+    choice = choose_pulse._decide([learned, other], small=small)
+    assert choice.best is learned and choice.doubt == pytest.approx(doubt)
+
+
 @pytest.mark.parametrize("name", [choose_pulse.OF_ALL, *choose_pulse.ROUNDS])
 def test_what_was_learned_again_is_learned_from_all_waveforms_too(name):
     block = record(gaussian, 5, n=60)[0]

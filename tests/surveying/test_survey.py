@@ -11,7 +11,7 @@ from writer_tools import data_file, leave_out
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
@@ -28,6 +28,7 @@ from wavebatch.surveying.systems.known_systems import (
     find_source,
     known_systems,
 )
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.survey_result import load_survey
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
@@ -429,6 +430,19 @@ def test_fifty_packets_with_hardly_an_isolated_echo_are_a_guess(leica, tmp_path)
     """Five Gaussians explained the fifty packets that they were learned from: 82 % more echoes, and no word."""
     small = _survey(cut_strip(leica, tmp_path / "cut.las", 50))
     assert [one.code for one in doubt_survey(small.system, small.figures, small.waveforms)] == ["pulse-guess"]
+
+
+@pytest.mark.parametrize(
+    ("waveforms", "width", "echoes", "said"),
+    [
+        (60, 0.01, 0.01, 0), (60, 0.06, 0.01, 1), (60, 0.01, 0.06, 1), (60, None, 0.0, 1), (39, 0.0, 0.0, 1),
+        (120, 0.04, 0.14, 0), (120, 0.06, 0.0, 1),
+    ],
+)  # fmt: skip
+def test_few_isolated_echoes_are_a_guess_where_pulses_do_not_agree(waveforms, width, echoes, said):
+    figures = Figures(isolated_echoes=5, width_in_doubt=width, echoes_in_doubt=echoes)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0, by_kind={"quiet": 1.0}))
+    assert len(list(doubt_survey(system, figures, waveforms))) == said
 
 
 OTHERS = {

@@ -83,6 +83,10 @@ BLIND = 2 / 3
 """Waveforms in which a pulse finds an echo, over those of another one, from which that it needs fewer echoes says
 nothing: it does not see them. Gaussians of 24 to 192 samples saw 3 to 20 % of the echoes of pulses that lasted one."""
 
+OWN = 2.0
+"""Standard errors by which a pulse looks too good to the waveforms that it was learned from: a nat for each of its 18
+parameters, where fifty waveforms scatter by one or two."""
+
 SHOWN = 0.7
 """Standard errors, over the root of the waveforms with an echo, that there are where each of them gains, by amounts
 that scatter as much as they are large: 24 such waveforms never show the 4.5 that another number of echoes asks for."""
@@ -97,9 +101,12 @@ start: they had 3 to 5 % of false echoes in place of 1 to 2."""
 MISFITS = LEAST_MISFIT * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried, up to MOST_MISFIT."""
 
-OF_ALL, AGAIN = "gaussian of all echoes", ", again"
-ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}
+OF_ALL, OF_ANY, AGAIN = "gaussian of all echoes", "all echoes", ", again"
+ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, OF_ANY: {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
+
+MORE_ROUNDS = 8
+"""Further rounds of all echoes, at most: each goes a part of the way, and five reached a pulse that was a sixth off."""
 
 FIRST_CHANGE = 0.01
 """Change of the pulse from shot to shot, at least, in the first round of each: what a pulse of few Gaussians misses
@@ -219,16 +226,15 @@ def choose_pulse(
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    tried = {one.name: one.system for one in hopeful}
-    tried |= {OF_ALL: own} if plain else dict(_learn(taught, begin))
+    tried = {one.name: one.system for one in hopeful} | ({OF_ALL: own} if plain else {})
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    found = _try_changes(held, found)
-    choice = _decide(found)
+    found = _try_changes(held, found if plain else found + _learn(taught, held, begin))
+    choice = _decide(found, small=small)
     if abs(choice.best.system.sigma_ref / begin.system.sigma_ref - 1) > OTHER_WIDTH and choice.best.name in starts:
         # Few waveforms showed another start: what was learned from it may be of another pulse.
-        again = {name + AGAIN: system for name, system in _learn(taught, choice.best)}
-        found += _try_changes(held, [_judge(held, *one, CHANGES[1], known=False) for one in again.items()])
-        choice = _decide(found)
+        again = [replace(one, name=one.name + AGAIN) for one in _learn(taught, held, choice.best)]
+        found += _try_changes(held, again)
+        choice = _decide(found, small=small)
     if choice.tied and len(rows) < len(block):
         others = np.delete(np.arange(len(block)), rows[::2])
         choice = _decide_by_more(block.rows(others[spread_rows(len(others), MORE * number)]), found, choice)
@@ -253,7 +259,26 @@ def _find_gaussian(block: WaveformBlock, system: SystemPulse, change: float) -> 
     return replace(system, sigma_ref=system.sigma_ref * own)
 
 
-def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
+def _learn(taught: WaveformBlock, held: WaveformBlock, begin: Candidate) -> list[Candidate]:
+    """Pulses learned from some waveforms and judged on others; of all echoes the round that is described shortest.
+
+    Where echoes are close, the first rounds end far from the pulse.
+    """
+    found = [_judge(held, name, system, CHANGES[1], known=False) for name, system in _list_rounds(taught, begin)]
+    if not found or found[-1].name != OF_ANY:
+        return found
+    rounds = found[-2:]
+    while len(rounds) < 2 + MORE_ROUNDS:
+        before, last = rounds[-2:]
+        if _save(last, before) <= LEAST_SAVED or before.exceeds(last) <= HINT:
+            break
+        explained = explain(taught, bear(last.system, begin.change))
+        system = learn_jointly(taught, last.system, explained, begin.change, last=True)
+        rounds.append(_judge(held, OF_ANY, system, CHANGES[1], known=False))
+    return [*found[:-1], min(rounds[1:], key=lambda one: one.typical)]
+
+
+def _list_rounds(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
     """Pulses learned from one echo per cluster and from all echoes, two rounds each; before them a Gaussian."""
     system = begin.system
     if not (system.components or system.kappa):
@@ -326,7 +351,7 @@ def _find_change(block: WaveformBlock, judged: Mapping[float, Candidate]) -> Can
     return replace(found, length=best.length, as_likely=as_likely)
 
 
-def _decide(found: list[Candidate]) -> Choice:
+def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
     """The candidate with the simplest pulse that no other one beats surely.
 
     Of pulses as simple the one with the fewest echoes, or the shortest description of those within AS_FEW of it.
@@ -345,9 +370,11 @@ def _decide(found: list[Candidate]) -> Choice:
         if _beats(one, best):
             best = one
     tied = [one for one in ordered if one.exceeds(best) < SURE]
-    if SHOWN * np.sqrt(best.answered) < SURE + HINT:  # fewer echoes lost by less than many waveforms would ask for
-        rivals = (one for one in ordered if one.echoes < FEWER * best.echoes and one.answered >= BLIND * best.answered)
-        tied += [one for one in rivals if SURE <= one.exceeds(best) < SURE + HINT]
+    # Fewer echoes lost by less than many waveforms would ask for, or than waveforms that were learned from can show.
+    most = SURE + HINT if SHOWN * np.sqrt(best.answered) < SURE + HINT else SURE
+    most = HOPELESS + OWN if small else most
+    rivals = (one for one in ordered if one.echoes < FEWER * best.echoes and one.answered >= BLIND * best.answered)
+    tied += [one for one in rivals if SURE <= one.exceeds(best) < most]
     echoes = [*best.as_likely, *(one.echoes / max(best.echoes, 1) for one in tied)]
     doubt = max(echoes) - min(echoes)
     widths = [one.system.sigma_ref for one in tied]
@@ -374,13 +401,17 @@ def _decide_by_more(block: WaveformBlock, found: list[Candidate], first: Choice)
     return replace(choice, tried=tuple(sorted([*choice.tried, *lost], key=lambda one: one.nats)))
 
 
+def _save(shorter: Candidate, longer: Candidate) -> float:
+    """Nats per echo that one candidate saves in place of another."""
+    return (longer.typical - shorter.typical) * len(longer.length) / max(longer.echoes, 1)
+
+
 def _beats(shorter: Candidate, longer: Candidate) -> bool:
     """Whether a candidate describes so much shorter that it is taken in place of the other."""
     least = LEAST_SAVED if longer.gaussians == 1 < shorter.gaussians else 0.0
     if longer.known and not shorter.known and abs(shorter.system.sigma_ref / longer.system.sigma_ref - 1) < OTHER_WIDTH:
         least = LEAST_OF_KNOWN
-    saved = (longer.typical - shorter.typical) * len(longer.length) / max(longer.echoes, 1)
-    return saved > least and longer.exceeds(shorter) > _bound_errors(shorter, longer)
+    return _save(shorter, longer) > least and longer.exceeds(shorter) > _bound_errors(shorter, longer)
 
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:

@@ -268,7 +268,9 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms, and a shipped
     # pulse may be that of another sensor. Of more waveforms the judge knows the width, or that it does not.
     unsure = figures.width_in_doubt is None or figures.width_in_doubt > MOST_SPREAD
-    few = alone < FEW and (waveforms < HALVED or (unsure and not (known or system.components)))
+    # All pulses that these do not exclude may agree, unless there are hardly more waveforms than a pulse needs echoes.
+    agreed = waveforms >= 2 * FEW and not unsure and doubt is not None and doubt <= MOST_DOUBTED_KNOWN
+    few = alone < FEW and (not agreed if waveforms < HALVED else unsure and not (known or system.components))
     if few:
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     measured = system.noise.by_kind
