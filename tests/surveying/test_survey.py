@@ -18,6 +18,7 @@ from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
 from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample
 from wavebatch.surveying.systems import known_systems as module
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import (
     MOST_DOUBTED,
     MOST_DOUBTED_KNOWN,
@@ -28,7 +29,6 @@ from wavebatch.surveying.systems.known_systems import (
     find_source,
     known_systems,
 )
-from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.survey_result import load_survey
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
