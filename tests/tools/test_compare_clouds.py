@@ -3,6 +3,7 @@
 import csv
 import json
 import tracemalloc
+from dataclasses import replace
 
 import laspy
 import naive
@@ -646,7 +647,8 @@ def test_as_a_loop_does_it(rng):
     time, amplitude, sigma = (rng.uniform(*ends, len(waveform)) for ends in ((5, 59), (10, 300), (1.5, 3)))
     order = np.lexsort((time, waveform))
     echoes = EchoTable.build(waveform[order], time[order], amplitude[order], sigma[order])
-    baseline, std = rng.uniform(8, 12, n).astype("f4"), rng.uniform(0.5, 2, n).astype("f4")
+    baseline, std = rng.uniform(1, 12, n).astype("f4"), rng.uniform(0.5, 2, n).astype("f4")
+    missing = rng.random((n, s)) < 0.05
     x = np.arange(float(s))
     samples = np.zeros((n, s), np.uint8)
     naive_e, naive_floor = np.full(n, np.nan), np.full(n, np.nan)
@@ -654,14 +656,15 @@ def test_as_a_loop_does_it(rng):
         mine = np.flatnonzero(waveform == w)
         f = sum((amplitude[m] * naive.pulse(x, time[m], sigma[m]) for m in mine), np.zeros(s))
         samples[w] = np.clip(np.rint(baseline[w] + f + std[w] * rng.standard_normal(s)), 0, top)
-        used = samples[w] < top
+        used = (samples[w] < top) & (samples[w] > 0) & ~missing[w]
         if len(mine):
             naive_e[w] = ((f - (samples[w] - float(baseline[w])))[used] ** 2).sum() / (f[used] ** 2).sum()
             naive_floor[w] = used.sum() * float(std[w]) ** 2 / (f[used] ** 2).sum()
-    assert (samples == top).any()
-    block = WaveformBlock.from_samples(samples)
+    assert (samples == top).any() and (samples == 0).any()
+    block = replace(WaveformBlock.from_samples(samples), missing=missing)
     step = Step(STAGES["decompose.gaussian"])
-    misfit, floor = measure_fit(block, Noise(baseline, std), SystemPulse(2.0), step, echoes)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=10.0))  # far above 0, where samples are cut off
+    misfit, floor = measure_fit(block, Noise(baseline, std), system, step, echoes)
     np.testing.assert_allclose(misfit, naive_e, rtol=1e-4)
     np.testing.assert_allclose(floor, naive_floor, rtol=1e-5)
     quality, both = FitQuality(), (count > 0) & (rng.random(n) < 0.5)

@@ -31,6 +31,7 @@ def test_points_and_records_of_any_file(tmp_path, point_format):
     assert facts["returns"] == {str(k): n for k, n in zip(numbers.tolist(), counts.tolist(), strict=True)}
     kinds, counts = np.unique(np.asarray(cloud.classification), return_counts=True)
     assert facts["classes"] == {str(k): n for k, n in zip(kinds.tolist(), counts.tolist(), strict=True)}
+    assert len(facts["point_sources"]) == 20  # the most frequent ones
     assert facts["intensity"] == [cloud.intensity.min(), cloud.intensity.max()]
     if point_format == 0:
         assert facts["gps_time"] is None
@@ -113,3 +114,5 @@ def test_times_that_are_no_seconds_of_the_week_are_not_called_so():
     header = SimpleNamespace(global_encoding=0)
     assert _describe_time(header, (1e9, 1.1e9))["kind"].startswith("unknown (the header says seconds of the week")
     assert _describe_time(header, (5.0, 604_000.0))["kind"] == "seconds of the week"
+    header = SimpleNamespace(global_encoding=1)
+    assert [_describe_time(header, (1e8, end)).get("dates_gps") is None for end in (2e8, 5e9)] == [False, True]

@@ -22,7 +22,7 @@ from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.pairing import compare_clouds
-from wavebatch.tools.return_stats import BINS, AreaGrid, PolygonSet, Separation, count_returns, find_dead_zone
+from wavebatch.tools.return_stats import BINS, AreaGrid, DeadZone, PolygonSet, Separation, count_returns, find_dead_zone
 from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, returns, simulate_returns, simulate_strip
 from wavebatch.tools.simulate.returns import Radar, SynthesisOptions, synthesize_strip
 
@@ -86,7 +86,7 @@ def test_points_without_a_time_are_not_one_pulse(tmp_path, missing):
     assert (found.pulses, found.pulses_by) == (40, "gps_time") and found.by_count[3] == pytest.approx(0.25)
     assert found.warnings[0].startswith("points without GPS time (0 or NaN): 30;")
     (again,), _ = count_returns([tmp_path / "a.las"], held=5)
-    assert again.by_count == found.by_count
+    assert (again.by_count, again.warnings) == (found.by_count, found.warnings)
 
 
 @pytest.mark.parametrize(("deep", "limited"), [(1, False), (40, True)])
@@ -128,6 +128,15 @@ def test_counted_pulses_whose_points_are_missing_are_not_stored_twice(tmp_path):
     found = count_returns([write_cloud(tmp_path / "c.las", np.zeros(120), -2.0 * number, number, np.full(120, 2))])[1]
     assert found.incomplete and not any(line.startswith("crowded") for line in found.warnings)
     assert any(line.startswith("incomplete") for line in found.warnings)
+
+
+@pytest.mark.parametrize(("points", "said"), [(3, "crowded: 5 of 1000 pulses"), (1, "incomplete: 5 of 1000 pulses")])
+def test_half_a_percent_of_wrong_pulses_is_named(tmp_path, points, said):
+    count = np.where(np.arange(1000) % 200, 2, points)
+    pulse = np.repeat(np.arange(1000), count)
+    number = np.arange(len(pulse)) - np.repeat(np.cumsum(count) - count, count) + 1
+    path = write_cloud(tmp_path / "c.las", 1.0 + pulse, -2.0 * number, number, np.full(len(pulse), 2))
+    assert any(line.startswith(said) for line in count_returns([path])[1].warnings)
 
 
 def test_a_cloud_that_cannot_be_read_is_named_and_the_others_are_counted(tmp_path):
@@ -191,6 +200,12 @@ def test_error_of_a_dead_zone_is_the_size_of_its_miss(rng, pairs, mean):
     assert np.min(misses) > -1.01
 
 
+def test_one_pair_of_a_thousand_may_lie_in_a_dead_zone():
+    bins = np.zeros(BINS, np.int64)
+    bins[50] = bins[90:1089] = 1
+    assert find_dead_zone(bins) == DeadZone(1000, 0.9, 0.02)
+
+
 def test_few_pairs_have_no_dead_zone_and_the_text_says_why(tmp_path, rng):
     path = _write_pairs(tmp_path / "c.las", (1, 1, 1), 40, rng)
     result = CliRunner().invoke(stats, [str(path), "--json"])
@@ -205,15 +220,16 @@ def test_few_pairs_have_no_dead_zone_and_the_text_says_why(tmp_path, rng):
     assert zones["all"] == {"pairs": 600, "size": None, "error": None}
 
 
-def test_hidden_pairs_are_those_that_as_many_as_just_above_the_zone_would_be(tmp_path):
+@pytest.mark.parametrize("near", [300, 20])
+def test_hidden_pairs_are_those_that_as_many_as_just_above_the_zone_would_be(tmp_path, near):
     """Distances at least 1 m, 300 per metre up to 2 m and 100 per metre beyond: the zone hides 300 of 1000 pulses."""
-    apart = np.concatenate([np.linspace(1.0, 1.999, 300), np.linspace(2.0, 8.999, 700)])
+    apart = np.concatenate([np.full(2, 1.0), np.linspace(1.0, 1.999, near - 2), np.linspace(2.01, 8.999, 1000 - near)])
     time, number = np.repeat(1.0 + np.arange(1000), 2), np.tile([1, 2], 1000)
     z = 100.0 - np.stack([np.zeros(1000), apart], axis=1).ravel()
     found = count_returns([write_cloud(tmp_path / "c.las", time, z, number, np.full(2000, 2))])[1]
     assert found.dead_zone == pytest.approx(1.0, abs=0.011)
-    assert found.hidden == pytest.approx(0.3, abs=0.006)
-    assert any(line.startswith("dead zone") and "0.30" in line for line in found.warnings)
+    assert found.hidden == pytest.approx(near / 1000, abs=0.006)
+    assert any(line.startswith("dead zone") and f"{found.hidden:.3f}" in line for line in found.warnings)
 
 
 def make_cloud(path, n=800, seed=0, east=300_000.0):
@@ -683,6 +699,9 @@ def test_widths_of_which_most_are_possible_are_taken_as_nanoseconds(cloud, tmp_p
     given = add_columns(cloud, tmp_path / "c.las", some=some)
     result = run(given, "-o", tmp_path / "s.las", "--widths", "some", *gain)
     assert result.exit_code == 0 and "some states no unit; its values were taken as nanoseconds" in result.stderr
+    some[: int(0.6 * points)] = 4000.0
+    given = add_columns(cloud, tmp_path / "d.las", some=some)
+    assert "values are outside of" in run(given, "-o", tmp_path / "t.las", "--widths", "some", *gain).stderr
 
 
 def test_shares_above_one_together_are_scaled_and_counted(cloud, tmp_path):

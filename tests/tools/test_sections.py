@@ -113,6 +113,8 @@ def test_the_cube_has_every_sample_on_one_axis_of_time(riegl, tmp_path):
         lines = list(read_scan_lines(reader, scan))[:6]
     cube = build_cube(tmp_path / "c.npz", lines)
     values, time, spacing = cube["values"], cube["time"], lines[0].spacing
+    others = [lines[0], replace(lines[1], spacing=2 * spacing)]
+    refuses(InputError, "differ in their spacing", build_cube, tmp_path / "d.npz", others)
     columns = align_pulses(lines)
     assert values.shape == (6, 1 + max(map(max, columns)), len(time)) and np.diff(time) == pytest.approx(spacing)
     assert np.isfinite(values).sum() == sum(len(line.row) for line in lines)
@@ -172,6 +174,8 @@ def test_slices_of_the_cube(tmp_path):
     for wrong, message in (({"y": 8}, "scan lines 7 to 9"), ({"x": 3}, "0 to 2"), ({"t": 9.0}, "0 to 1.5 ns")):
         refuses(ConfigError, message, cut_cube, path, {"x": None, "y": None, "t": None, **wrong})
     refuses(InputError, "no scan line", build_cube, tmp_path / "empty.npz", [])
+    np.savez(path, values=values, time=-np.arange(4.0), line=np.array([7, 9]))
+    refuses(InputError, "times do not ascend", cut_cube, path, dict.fromkeys("xyt"))
 
 
 def test_slice_writes_cube_and_overview_once(riegl, tmp_path):
