@@ -19,7 +19,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Survey, survey_block
-from wavebatch.tools.bench.accuracy import AccuracyTally, Group, derive_seed, describe_found, make_group
+from wavebatch.tools.bench.accuracy import AccuracyTally, Group, derive_seed, make_group
 from wavebatch.tools.bench.command import AUTO, find_twin
 from wavebatch.tools.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.tools.simulate.scenes import LogUniform, Mixture
@@ -122,7 +122,7 @@ def _measure(chains: list[Chain], groups: list[Group]) -> dict[str, Any]:
         for flag in EchoFlag:
             flags[flag.name] += int(np.count_nonzero(found.flags & np.uint16(flag)))
         echoes += len(found)
-        tally.add(group, describe_found(found))
+        tally.add(group, found)
     return {
         "waveforms": tally.waveforms,
         "echoes": echoes,

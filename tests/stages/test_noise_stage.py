@@ -11,7 +11,7 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import maximum
-from wavebatch.stages.noise import pooled
+from wavebatch.stages.noise import _lowest_levels, pooled
 from wavebatch.stages.pulse_tables import noise_factors
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.5, std=1.1))
@@ -86,6 +86,11 @@ def test_a_wrong_level_is_neither_an_echo_nor_an_amplitude(correlation):
     (false, scatter, _, _), (left, rest, within, number) = found
     assert left < 0.4 * false and rest < (0.9 if correlation else 0.5) * scatter
     assert 0.6 < within < 0.8 and number >= 0.99 * 2 * m
+
+
+def test_the_lowest_tenth_of_noise_gives_its_level(rng):
+    signal = rng.normal(12.0, 2.0, (100, 400)).astype(np.float32)
+    assert _lowest_levels(signal, 2.0).mean() == pytest.approx(12.0, abs=0.2)
 
 
 def test_the_level_of_a_recording_has_an_error_of_its_own():

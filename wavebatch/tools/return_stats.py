@@ -86,10 +86,6 @@ class AreaGrid:
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
-    def place(self, cloud: Path) -> tuple[AreaGrid, str]:
-        """The division in the coordinates of a cloud, and a line that says that no area lies there, else empty."""
-        return self, ""
-
 
 class PolygonSet:
     """A division into polygons; where polygons overlap, a position belongs to the first one."""
@@ -110,7 +106,10 @@ class PolygonSet:
         return OUTSIDE if number == _OUTSIDE else Area("polygon", self.polygons[number].name)
 
     def place(self, cloud: Path) -> tuple[PolygonSet, str]:
-        """As AreaGrid.place; raises as `Polygon.place`."""
+        """The polygons in the coordinates of a cloud, and a line where none lies there, else an empty one.
+
+        Raises as `Polygon.place`.
+        """
         header = read_header(cloud)
         placed = [polygon.place(cloud, header) for polygon in self.polygons]
         return PolygonSet(placed), describe_miss([ring for polygon in placed for ring in polygon.rings], header)
@@ -407,7 +406,7 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter,
     with CloudReader(path, RETURN_DTYPE) as reader:
         by_time = pulses_told_apart(reader)  # by all points
         reader.select(chosen)
-        placed = [division.place(path) for division in divisions]
+        placed = [one.place(path) if isinstance(one, PolygonSet) else (one, "") for one in divisions]
         areas = [AreaTally(division) for division, _ in placed]
         tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
         tally.notes = [line for _, line in placed if line]

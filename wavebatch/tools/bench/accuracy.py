@@ -311,14 +311,6 @@ def find_hidden(truth: EchoTable, matched: np.ndarray) -> np.ndarray:
     return hidden
 
 
-def describe_found(found: EchoTable) -> EchoTable:
-    """The echoes with sigma replaced by echo_width over 2.354820, where the chain computes echo_width."""
-    if "echo_width" not in found.attributes:
-        return found
-    factor = np.float32(1 / FWHM_PER_SIGMA)
-    return replace(found, **{f"sigma{end}": found.attributes[f"echo_width{end}"] * factor for end in ("", "_err")})
-
-
 @dataclass(slots=True)
 class AccuracyTally:
     """Collects the echoes found in groups; `figures` summarises them."""
@@ -329,7 +321,10 @@ class AccuracyTally:
     _echoes: list[dict[str, np.ndarray]] = field(default_factory=list)
 
     def add(self, group: Group, found: EchoTable) -> None:
-        """Adds the echoes found in the waveforms of a group."""
+        """Adds the echoes found in the waveforms of a group: with echo_width, if they have it, as 2.354820 sigma."""
+        if "echo_width" in found.attributes:
+            factor, ends = np.float32(1 / FWHM_PER_SIGMA), ("", "_err")
+            found = replace(found, **{f"sigma{end}": found.attributes[f"echo_width{end}"] * factor for end in ends})
         n, truth = len(group.block), group.truth
         match = match_echoes(found, truth)
         matched = np.zeros(len(truth), bool)

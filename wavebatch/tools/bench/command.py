@@ -137,7 +137,7 @@ def _measure_scene(
     for name, tally in tallies.items():
         progress(f"{scene.name}: error of {name}")
         for group, of_group in zip(groups, chosen, strict=True):
-            tally.add(group, accuracy.describe_found(of_group[name].run(group.block, group.system)))
+            tally.add(group, of_group[name].run(group.block, group.system))
     timed = {name: (chain, groups[0].system) for name, chain in measured.items()}
     block, strip = groups[0].block, None
     with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as folder:

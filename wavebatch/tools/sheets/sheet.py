@@ -174,11 +174,8 @@ def format_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], *, digits: in
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(head)
-    table.writerows([_csv_cell(value, digits) for value in row] for row in rows)
+    for row in rows:
+        known = ["" if value is None or isinstance(value, float) and not math.isfinite(value) else value
+                 for value in row]  # fmt: skip
+        table.writerow([f"{value:.{digits}g}" if isinstance(value, float) else value for value in known])
     return text.getvalue()
-
-
-def _csv_cell(value: Any, digits: int) -> Any:
-    if value is None or isinstance(value, float) and not math.isfinite(value):
-        return ""
-    return f"{value:.{digits}g}" if isinstance(value, float) else value
