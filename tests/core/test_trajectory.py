@@ -41,6 +41,30 @@ def test_nothing_is_said_outside_and_in_gaps():
     assert path.share_known(300_000_005.0, 300_000_009.0) == pytest.approx(0.0, abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("rate", "noise", "rows", "size"),
+    [
+        (200.0, 0.0, slice(700, 701), 30.0),
+        (20.0, 0.0, slice(70, 90), 30.0),
+        (20.0, 0.3, slice(70, 71), 30.0),
+        (1.0, 0.0, slice(7, 8), 40.0),
+        (20.0, 0.3, slice(0), 0.0),
+        (1.0, 0.0, slice(0), 0.0),
+        (20.0, 0.0, slice(370, 371), 0.0),  # after the strip
+    ],
+)
+def test_positions_that_no_aircraft_takes_are_found(rate, noise, rows, size):
+    """A damaged row put 5 % of the echoes 30 m off, or 5,000 km, with errors of 1 mm."""
+    time, xyz = flight(rate)
+    xyz += noise * np.random.default_rng(2).standard_normal(xyz.shape)
+    xyz[rows] += [0.0, 0.0, size or 30.0]
+    jump = Trajectory.build(time, xyz).find_jump(300_000_001.0, 300_000_016.0)
+    assert (jump is not None) == (size > 0.0)
+    if jump is not None:
+        assert time[rows][0] <= jump[0] <= time[rows][-1] + 2.0 / rate
+        assert 0.4 * size < jump[1] < 1.1 * size
+
+
 @pytest.mark.parametrize("number", [0, 1])
 def test_too_few_positions(number):
     refuses(InputError, "at least two are needed", Trajectory.build, np.arange(number), np.zeros((number, 3)))

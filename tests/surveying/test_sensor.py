@@ -317,6 +317,17 @@ def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
     assert "\n" not in str(caught.value) and "project the strip" in str(caught.value)
 
 
+def test_a_damaged_row_of_a_trajectory_is_refused(tmp_path):
+    flight = Sensor(rate=5000.0, n_samples=40)
+    trajectory = facet_strips.write_trajectory(tmp_path / "t.csv", flight, 2.0)
+    strip = write_strip(tmp_path / "a.las", [Facet(0.3)], flight, 8000)
+    find(strip, trajectory=trajectory)
+    lines = trajectory.read_text().splitlines()
+    time, x, y, z = lines[60].split(",")
+    trajectory.write_text("\n".join([*lines[:60], f"{time},{x},{y},{float(z) + 30.0}", *lines[61:]]))
+    refuses(InputError, "jumps by 30 m at 3000000", find, strip, trajectory=trajectory)
+
+
 def test_times_rounded_to_seconds_make_no_pairs_of_returns(tmp_path, edit_points):
     """Neighbouring pulses of one time were taken for returns of one: ranges were 383 m off, with errors of 2.5 m."""
 

@@ -26,6 +26,13 @@ LEAST_STEP = 1e-9
 GAP_STEPS = 5.0
 """Gaps up to this many usual steps are bridged too."""
 
+ACCELERATION = 30.0
+"""Most that a sensor is accelerated [m/s2]: three times gravity."""
+
+LEAST_JUMP, JUMP_SCATTER = 1.0, 10.0
+"""A position jumps that is off the line between its neighbours by so much [m], and so many times what most are, beyond
+what ACCELERATION explains."""
+
 
 @frozen(eq=False)
 class Trajectory:
@@ -125,6 +132,19 @@ class Trajectory:
         empty.append((float(self.time[-1]), np.inf))
         cut = [(max(a, start), min(b, stop)) for a, b in empty]
         return [(float(a), float(b)) for a, b in cut if b > a]
+
+    def find_jump(self, start: float, stop: float) -> tuple[float, float] | None:
+        """Time [s] and size [m] of the largest jump between two times [s]; None where no position jumps."""
+        step = np.diff(self.time)
+        before, after = step[:-1], step[1:]
+        line = (after[:, None] * self.xyz[:-2] + before[:, None] * self.xyz[2:]) / (before + after)[:, None]
+        off = np.sqrt(((self.xyz[1:-1] - line) ** 2).sum(axis=1))
+        near = (self.time[2:] >= start) & (self.time[:-2] <= stop) & (np.maximum(before, after) <= self.gap)
+        if not near.any():
+            return None
+        beyond = off - 0.5 * ACCELERATION * before * after - LEAST_JUMP - JUMP_SCATTER * float(np.median(off[near]))
+        worst = int(np.argmax(np.where(near, beyond, -np.inf)))
+        return (float(self.time[worst + 1]), float(off[worst])) if beyond[worst] > 0 else None
 
     def share_known(self, start: float, stop: float) -> float:
         """Share of [start, stop] that has positions, 0 to 1."""

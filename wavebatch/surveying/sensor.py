@@ -383,6 +383,11 @@ def _from_file(
     with naming(path):
         offset, clocks = solve_offset(known, start, stop)
         known = known.shifted(offset).between(start - MARGIN, stop + MARGIN)
+        if jump := known.find_jump(start, stop):
+            raise InputError(
+                f"the trajectory jumps by {jump[1]:.3g} m at {jump[0] - offset:.2f} s, as no aircraft does: a row "
+                "there is damaged; take it out, and positions are interpolated"
+            )
         ahead = rays.point - known.at(rays.time)
         distance = np.sqrt((ahead * ahead).sum(axis=1))
         angle = _disagreement(ahead, distance, rays)
