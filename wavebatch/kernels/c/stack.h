@@ -32,26 +32,37 @@ static double draw_stacked(const Stacked *s, const double *p, double *z, double 
     return cost;
 }
 
-/* Normal equations (3 m, 3 m), below the diagonal, and the way downhill (3 m). */
+/* Normal equations (3 m, 3 m), below the diagonal, and the way downhill (3 m). Every sum goes through the lags in order; two
+   rows of the matrix by eight columns are in registers meanwhile. rows: (n, stride), room for 3 m columns and the rest. */
 INLINE void gather_stacked(const Stacked *s, const double *p, const double *z, const double *bell, const double *rest,
-                           double *row, double *normal, double *downhill) {
+                           int64_t stride, double *rows, double *normal, double *downhill) {
     const int64_t size = 3 * s->m;
-    memset(normal, 0, size * size * sizeof(double));
-    memset(downhill, 0, size * sizeof(double));
-    for (int64_t i = 0; i < s->n; i++) {
-        for (int64_t c = 0; c < s->m; c++) {
-            const double *own = p + 3 * c, first = earliest(s, own[2]), at = z[c * s->n + i];
+    for (int64_t c = 0; c < s->m; c++) {
+        const double *own = p + 3 * c, first = earliest(s, own[2]);
+        const double moves = first > s->early && first < s->last ? 2 * (1 - own[1]) : 0;
+        for (int64_t i = 0; i < s->n; i++) {
+            double *row = rows + i * stride + 3 * c, at = z[c * s->n + i];
             const double height = bell[c * s->n + i] * s->weight[i], by_delay = own[0] * height * at / own[2];
-            const int moves = first > s->early && first < s->last;
-            row[3 * c] = height;
-            row[3 * c + 1] = by_delay * (s->end - first);
-            row[3 * c + 2] = by_delay * (at + (moves ? 2 * (1 - own[1]) : 0));
-        }
-        for (int64_t a = 0; a < size; a++) {
-            downhill[a] -= row[a] * rest[i];
-            for (int64_t b = 0; b <= a; b++) normal[a * size + b] += row[a] * row[b];
+            row[0] = height;
+            row[1] = by_delay * (s->end - first);
+            row[2] = by_delay * (at + moves);
         }
     }
+    for (int64_t i = 0; i < s->n; i++) rows[i * stride + size] = -rest[i];
+    for (int64_t a = 0; a <= size; a += 2)
+        for (int64_t b = 0; b < size && b <= a + 1; b += 2 * LANES) {
+            wide sum[4] = {{0}};
+            for (const double *row = rows; row < rows + s->n * stride; row += stride) {
+                const wide low = *(const wide *)(row + b), high = *(const wide *)(row + b + LANES);
+                sum[0] += row[a] * low; sum[1] += row[a] * high;
+                sum[2] += row[a + 1] * low; sum[3] += row[a + 1] * high;
+            }
+            for (int64_t q = 0; q < 4 * LANES; q++) {
+                const int64_t i = a + q / (2 * LANES), j = b + q % (2 * LANES);
+                if (i == size && j < size) downhill[j] = sum[q / LANES][q % LANES];
+                if (i < size && j <= i) normal[i * size + j] = sum[q / LANES][q % LANES];
+            }
+        }
 }
 
 /* Where a damped step leads; an unknown at its bound that would leave it is held. */
@@ -78,12 +89,13 @@ static void step_stacked(const Stacked *s, double damping, const double *normal,
 /* Fits in place; at (3 m). */
 INLINE int64_t fit_stack_any(const Stacked *s, double *at) {
     const int64_t size = 3 * s->m, rows = s->m * s->n;
-    double *memory = malloc((2 * rows + s->n + 2 * size * size + 4 * size + 1) * sizeof(double));
+    const int64_t stride = size + 4 * LANES;
+    double *memory = calloc(2 * rows + s->n * (1 + stride) + 2 * size * size + 3 * size + 1, sizeof(double));
     if (!memory) return -1;
     double *z = memory, *bell = z + rows, *rest = bell + rows, *normal = rest + s->n, *matrix = normal + size * size;
-    double *downhill = matrix + size * size, *row = downhill + size, *pivot = row + size, *there = pivot + size;
+    double *downhill = matrix + size * size, *pivot = downhill + size, *there = pivot + size, *table = there + size;
     double cost = draw_stacked(s, at, z, bell, rest), damping = s->damping;
-    gather_stacked(s, at, z, bell, rest, row, normal, downhill);
+    gather_stacked(s, at, z, bell, rest, stride, table, normal, downhill);
     for (int64_t i = 1; i < s->most; i++) {
         step_stacked(s, damping, normal, downhill, at, matrix, pivot, there);
         const double found = draw_stacked(s, there, z, bell, rest);
@@ -93,7 +105,7 @@ INLINE int64_t fit_stack_any(const Stacked *s, double *at) {
             cost = found;
             damping = fmax(damping / 5, 1e-9);
             if (small) break;
-            gather_stacked(s, at, z, bell, rest, row, normal, downhill);
+            gather_stacked(s, at, z, bell, rest, stride, table, normal, downhill);
         } else if (damping > s->most_damping) {
             break;
         } else {
