@@ -27,9 +27,9 @@ AIR = 0.22
 class Facet:
     """A plane z = z0 + sx (x - x0) + sy (y - y0) where `inside(x, y)`; `inside` None: everywhere."""
 
-    reflectance: float | Callable[[np.ndarray, np.ndarray], np.ndarray]
-    z0: float = 0.0
+    reflectance: float | Callable[[np.ndarray, np.ndarray], np.ndarray] = 0.3
     slope: tuple[float, float] = (0.0, 0.0)
+    z0: float = 0.0
     centre: tuple[float, float] = (0.0, 0.0)
     inside: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
@@ -177,22 +177,32 @@ def _trace(origin: np.ndarray, ray: np.ndarray, facets: Sequence[Facet], sensor:
     half = 0.5 * sensor.divergence
     unit = ray[:, None] + half * (offsets[:, :1] * side[:, None] + offsets[:, 1:] * up[:, None])
     unit /= np.linalg.norm(unit, axis=2)[..., None]
-    best, strength = np.full(unit.shape[:2], np.inf), np.zeros(unit.shape[:2])
-    for facet in facets:
+    best, facing, number = meet(origin, unit, facets)
+    best = np.where(number < 0, 1e6, best)
+    x, y = (origin[:, None, axis] + best * unit[..., axis] for axis in (0, 1))
+    strength = np.zeros(unit.shape[:2])
+    for index, facet in enumerate(facets):
+        bright = facet.reflectance(x, y) if callable(facet.reflectance) else facet.reflectance
+        strength = np.where(number == index, bright * facing, strength)
+    air = 10.0 ** (-2e-4 * sensor.air * best)
+    return best, sensor.light * strength * air / best**2 / len(offsets)
+
+
+def meet(origin: np.ndarray, unit: np.ndarray, facets: Sequence[Facet]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance, cosine of the incidence, and number of the facet that each sub-ray (n, k, 3) meets first; -1: none."""
+    best, facing, number = np.full(unit.shape[:2], np.inf), np.zeros(unit.shape[:2]), np.full(unit.shape[:2], -1)
+    for index, facet in enumerate(facets):
         sx, sy = facet.slope
         height = origin[:, 2] - facet.z0 - sx * (origin[:, 0] - facet.centre[0]) - sy * (origin[:, 1] - facet.centre[1])
         fall = sx * unit[..., 0] + sy * unit[..., 1] - unit[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             t = height[:, None] / fall
-        x, y = (origin[:, None, axis] + t * unit[..., axis] for axis in (0, 1))
-        hit = (fall > 0) & (t > 0) & (t < best) & (True if facet.inside is None else facet.inside(x, y))
-        facing = fall / np.sqrt(1 + sx * sx + sy * sy)
-        best = np.where(hit, t, best)
-        bright = facet.reflectance(x, y) if callable(facet.reflectance) else facet.reflectance
-        strength = np.where(hit, bright * facing, strength)
-    best = np.where(np.isfinite(best), best, 1e6)
-    air = 10.0 ** (-2e-4 * sensor.air * best)
-    return best, sensor.light * strength * air / best**2 / len(offsets)
+        hit = (fall > 0) & (t > 0) & (t < best)
+        if facet.inside is not None:
+            hit &= facet.inside(*(origin[:, None, axis] + t * unit[..., axis] for axis in (0, 1)))
+        best, number = np.where(hit, t, best), np.where(hit, index, number)
+        facing = np.where(hit, fall / np.sqrt(1 + sx * sx + sy * sy), facing)
+    return best, facing, number
 
 
 def render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarray:

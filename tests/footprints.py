@@ -5,25 +5,15 @@ Widths, energies and angles come out of geometry here, not out of the formulas t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from facet_strips import C_AIR, EAST, NORTH, START, Sensor, Stored, render, write_pulses
+from facet_strips import C_AIR, EAST, NORTH, START, Sensor, Stored, meet, render, write_pulses
+from facet_strips import Facet as Plane
 
 __all__ = ["EAST", "NORTH", "Flight", "Plane", "Truth", "match", "roofs", "write_strip"]
-
-
-@dataclass(frozen=True)
-class Plane:
-    """z = z0 + sx (x - x0) + sy (y - y0) where `inside(x, y)`, everywhere without it; coordinates less EAST, NORTH."""
-
-    reflectance: float = 0.3
-    slope: tuple[float, float] = (0.0, 0.0)
-    z0: float = 0.0
-    centre: tuple[float, float] = (0.0, 0.0)
-    inside: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
 
 def roofs(degrees: Sequence[float], *, reflectance: float = 0.4, south: float = -100.0) -> list[Plane]:
@@ -101,8 +91,9 @@ def write_strip(path: Path, planes: Sequence[Plane], flight: Flight, pulses: int
     seconds = np.arange(pulses) / flight.rate
     origin, ray = _fly(flight, seconds)
     share, unit = _split(ray, flight)
-    distance, facing, plane = _trace(origin, unit, planes)
-    _, middle_facing, middle = _trace(origin, ray[:, None], planes)
+    distance, facing, plane = meet(origin, unit, planes)
+    assert (plane >= 0).all(), "every sub-ray must meet a plane"
+    hit, middle_facing, middle = meet(origin, ray[:, None], planes)
     reflect = np.array([one.reflectance for one in planes])
     energy = 1 + flight.energy_spread * rng.standard_normal(pulses)
     strength = flight.light * share * reflect[plane] * facing * 10.0 ** (-2e-4 * flight.air * distance) / distance**2
@@ -111,15 +102,14 @@ def write_strip(path: Path, planes: Sequence[Plane], flight: Flight, pulses: int
     wave = render(distance / C_AIR - first[:, None], strength, flight)
     counts = np.rint(20.0 + wave + flight.noise * rng.standard_normal(wave.shape))
     counts = np.clip(counts, 0, (1 << flight.bits) - 1).astype(np.uint16 if flight.bits > 8 else np.uint8)
-    hit = _trace(origin, ray[:, None], planes)[0][:, 0]
-    noisy = hit + flight.point_error * rng.standard_normal(pulses)
+    noisy = hit[:, 0] + flight.point_error * rng.standard_normal(pulses)
     sensor = Sensor(bits=flight.bits, n_samples=flight.n_samples, spacing=flight.spacing, energy_column="shot_energy",
                     store_energy=flight.store_energy)  # fmt: skip
     stored = Stored(origin, ray, first, noisy, facing)
     write_pulses(path, sensor, stored, seconds, np.ones(pulses, int), counts, 7.5 * energy)
     incidence = np.degrees(np.arccos(np.clip(middle_facing[:, 0], -1, 1)))
     pure = (plane == middle).all(axis=1)
-    return Truth(START + seconds, hit, incidence, reflect[middle[:, 0]], middle[:, 0], pure, energy)
+    return Truth(START + seconds, hit[:, 0], incidence, reflect[middle[:, 0]], middle[:, 0], pure, energy)
 
 
 def match(cloud_time: np.ndarray, truth: Truth) -> np.ndarray:
@@ -149,20 +139,3 @@ def _split(ray: np.ndarray, flight: Flight) -> tuple[np.ndarray, np.ndarray]:
     off_side, off_up = (np.outer(radius, wave(turns)).ravel() for wave in (np.cos, np.sin))
     unit = ray[:, None] + off_side[:, None] * side[:, None] + off_up[:, None] * up[:, None]
     return np.repeat(weights / 12, 12), unit / np.linalg.norm(unit, axis=2)[..., None]
-
-
-def _trace(origin: np.ndarray, unit: np.ndarray, planes: Sequence[Plane]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance, cosine of the incidence, and plane, of the first plane that each sub-ray (n, k, 3) meets."""
-    best, facing, plane = np.full(unit.shape[:2], np.inf), np.zeros(unit.shape[:2]), np.zeros(unit.shape[:2], int)
-    for number, one in enumerate(planes):
-        sx, sy = one.slope
-        above = origin[:, 2] - one.z0 - sx * (origin[:, 0] - one.centre[0]) - sy * (origin[:, 1] - one.centre[1])
-        fall = sx * unit[..., 0] + sy * unit[..., 1] - unit[..., 2]
-        along = above[:, None] / fall
-        hit = (along > 0) & (along < best)
-        if one.inside is not None:
-            hit &= one.inside(*(origin[:, None, axis] + along * unit[..., axis] for axis in (0, 1)))
-        best, plane = np.where(hit, along, best), np.where(hit, number, plane)
-        facing = np.where(hit, fall / np.sqrt(1 + sx * sx + sy * sy), facing)
-    assert np.isfinite(best).all(), "every sub-ray must meet a plane"
-    return best, facing, plane

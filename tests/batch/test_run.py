@@ -9,7 +9,7 @@ import laspy
 import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, read_outputs, run_one
-from commands import refuses, run_command, succeed
+from commands import fail, refuses, run_command, succeed
 from helpers_scenes import make_scene
 from writer_tools import read_provenance
 
@@ -321,8 +321,7 @@ def test_resume_takes_the_kept_survey_also_for_later_strips(strips, flown, tmp_p
     after = read_outputs(folder)
     assert {name: after[name] for name in before} == before
     assert _report(folder, "c")["request"] == _report(folder, "a")["request"]
-    later = fly(strips["c"], "-o", folder, "--survey", "flight")
-    assert later.exit_code == 4 and "exists already" in later.stderr
+    fail(4, "exists already", "run", strips["c"], "-o", folder, "--survey", "flight")
 
 
 @pytest.mark.slow

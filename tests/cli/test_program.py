@@ -358,24 +358,6 @@ def test_commands_profiles_and_choices(complete):
     assert complete("wavebatch run --las", 2) == ["plain,--las-version"]
 
 
-@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_a_real_bash_completes_file_names(tmp_path):
-    (tmp_path / "flight 7.las").touch()
-    program = tmp_path / "wavebatch"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -c "{PROGRAM}" "$@"\n')
-    program.chmod(0o755)
-    script = """
-        eval "$(_WAVEBATCH_COMPLETE=bash_source ./wavebatch)"
-        COMP_WORDS=(./wavebatch run --profile ba) COMP_CWORD=3
-        _wavebatch_completion ./wavebatch
-        echo "${COMPREPLY[@]}"
-        complete -p wavebatch
-    """
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    run = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert "balanced" in run.stdout.splitlines() and "-F _wavebatch_completion wavebatch" in run.stdout, run.stderr
-
-
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_every_shell_has_its_script(shell):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "_WAVEBATCH_COMPLETE": f"{shell}_source"}

@@ -139,8 +139,7 @@ def test_a_headerless_wdp_is_refused_unless_forced(tmp_path):
     simulate_strip("flat", strip, pulses=50, options=StripOptions(internal=False))
     packets = strip.with_suffix(".wdp")
     packets.write_bytes(b"\0" * 60 + packets.read_bytes()[60:])
-    refused = _run(strip, "-o", tmp_path / "a")
-    assert refused.exit_code == 4 and "headerless" in refused.stderr
+    fail(4, "headerless", "run", strip, "-o", tmp_path / "a")
     assert _run(strip, "-o", tmp_path / "a", "--headerless").exit_code == 0
 
 

@@ -9,7 +9,7 @@ import laspy
 import naive
 import numpy as np
 import pytest
-from commands import refuses, run_command
+from commands import fail, refuses, run_command
 from writer_tools import write_points
 
 from wavebatch.cli.compare import HEAD, list_rows
@@ -465,8 +465,7 @@ def test_rows_are_the_figures_of_the_document(tmp_path, tiny_strip):
             assert int(rows["number"]) == spread["number"]
             assert float(rows["mean"]) == pytest.approx(spread["mean"])
     assert not any("(" in value for value in found.values())
-    refused = run("fast", "balanced", "--strip", tiny_strip, "--limit", 200, "-o", target)
-    assert refused.exit_code == 2 and "--overwrite" in refused.stderr
+    fail(2, "--overwrite", "compare", "fast", "balanced", "--strip", tiny_strip, "--limit", 200, "-o", target)
 
 
 def test_no_data_is_an_empty_cell():

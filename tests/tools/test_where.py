@@ -6,7 +6,7 @@ import laspy
 import numpy as np
 import pytest
 from batch_tools import run_one
-from commands import run_command, succeed
+from commands import fail, run_command, succeed
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnReader
@@ -97,8 +97,7 @@ def test_plots_and_stats_take_it_on_the_command_line(cloud, split, tmp_path):
         result = run_command(*words)
         assert result.exit_code == 0 and f"{total - number} left out" in result.output
     words = ["plot", "map", str(cloud), "--column", "z", "--where", "z > 1e6", "-o", str(tmp_path / "none.png")]
-    result = run_command(*words)
-    assert result.exit_code == 1 and f"{total} of {total} points are left out by --where" in result.output
+    fail(1, f"{total} of {total} points are left out by --where", *words)
 
 
 def test_grids_are_of_them(cloud, split, tmp_path):
