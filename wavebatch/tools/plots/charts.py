@@ -76,13 +76,8 @@ def picture(title: str, size: tuple[float, float], draw: Callable[[Figure], None
 
 def chart(title: str, labels: tuple[str, str], draw: Callable[[Axes], None], words: str = "") -> list[Picture]:
     """A figure of one chart with a title and labels of its axes."""
-
-    def fill(figure: Figure) -> None:
-        axes = figure.add_axes(PLACE)
-        axes.set(title=plain_text(title, 60), xlabel=plain_text(labels[0], 60), ylabel=plain_text(labels[1], 40))
-        draw(axes)
-
-    return picture(title, SIZE, fill, words)
+    texts = {"title": plain_text(title, 60), "xlabel": plain_text(labels[0], 60), "ylabel": plain_text(labels[1], 40)}
+    return picture(title, SIZE, lambda figure: draw(figure.add_axes(PLACE, **texts)), words)
 
 
 def chart_pulse(system: SystemPulse, spacing: float, title: str = "System pulse") -> list[Picture]:
