@@ -221,7 +221,8 @@ def compare_pulses(a: SystemPulse, b: SystemPulse) -> float:
     reach = 30.0 * max(a.sigma_ref, b.sigma_ref)
     lag = np.arange(-reach, reach, step)
     first, second = draw_pulse(a, lag), draw_pulse(b, lag)
-    # Zeros after the pulses, so that shifts do not wrap around; other sizes than powers of two take up to 25 times as long.
+    # Zeros after the pulses, so that shifts do not wrap around; sizes other than powers of two take up to 25 times as
+    # long.
     size = 1 << (2 * len(lag)).bit_length()
     spectrum = np.fft.rfft(first, size) * np.conj(np.fft.rfft(second, size))
     together = float(np.fft.irfft(spectrum, size).max())
