@@ -75,7 +75,7 @@ def render_pulses(shape: PulseShape, n: int, s: int, waveform: np.ndarray, main:
 
 def count_echoes(waveform: np.ndarray, n: int) -> np.ndarray:
     """Return the first echo of each of n waveforms, and the number of echoes, int64 (n + 1,)."""
-    return np.cumsum(np.r_[0, np.bincount(waveform, minlength=n)], dtype=np.int64)
+    return np.concatenate(([0], np.cumsum(np.bincount(waveform, minlength=n)))).astype(np.int64, copy=False)
 
 
 def describe_left(sums: Sums, noise: SampleNoise, changes: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -157,7 +157,7 @@ def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal:
         around = parameters[2]
         smooth = np.convolve(residual, np.ones(5) / 5, mode="same")
         starts = [
-            np.r_[parameters, smooth[at], stack.lag[at], factor * around]
+            np.concatenate((parameters, (smooth[at], stack.lag[at], factor * around)))
             for at in sorted({int(np.argmax(smooth)), int(np.argmin(smooth))})
             for factor in (0.7, 1.5, 4.0)
         ]

@@ -109,7 +109,7 @@ def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:
     row, start, end = row[long], start[long], end[long]
     marks = _mark_runs(row, start, end, n, s)
     # The recorded samples next to both ends of each run, where it does not end with the waveform.
-    beside, first = np.r_[row, row], np.r_[start - 1, end]
+    beside, first = np.concatenate((row, row)), np.concatenate((start - 1, end))
     at = first[:, None] + np.repeat([-1, 1], len(row))[:, None] * np.arange(LEAST_RECORDED)
     place = beside[:, None], np.clip(at, 0, s - 1)
     known, outside = ((at >= 0) & (at < s) & ~marks[place]).all(axis=1), (first < 0) | (first >= s)
