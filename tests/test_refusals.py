@@ -165,6 +165,8 @@ FILES = [
      {"strip.pls": "PulseWavesPulse\0" + "\0" * 300}),
     ("info p.plz", 1, "`pulsezip -i p.plz -o p.pls` .. then `wavebatch import p.pls`",
      {"p.plz": "PulseWavesPulse\0" + "\0" * 300}),
+    ("import a.wvs -o x.las", 4, "; give the a.pls that it belongs to\n", {"a.wvs": "PulseWavesWaves"}),
+    ("stats t.npz", 1, "t.npz: not a LAS or LAZ file .. it is a file of arrays, as `voxelize`", {"t.npz": "PK\3\4"}),
     ("import strip.las -o x.las", 4, "it is LAS or LAZ, which `wavebatch run` reads\n"),
     *((f"{words} run/strip.laz", 1, "4, 5, 9 or 10; `wavebatch info` and `stats` read a cloud that wavebatch wrote\n")
       for words in ("survey", "voxelize --size 1 -o v.npz")),

@@ -126,6 +126,7 @@ def read_pulse_header(path: Path) -> PulseHeader:
         front = file.read(_HEADER_SIZE)
         if not front.startswith(SIGNATURE):
             remedy = "; it is LAS or LAZ, which `wavebatch run` reads" * front.startswith(b"LASF")
+            remedy += f"; give the {path.stem}.pls that it belongs to" * front.startswith(b"PulseWavesWaves")
             raise InputError(f"{path}: not a PulseWaves file (it does not begin with PulseWavesPulse){remedy}")
         if len(front) < _HEADER_SIZE:
             raise damaged(path, f"a header of {len(front)} bytes instead of {_HEADER_SIZE}")

@@ -302,6 +302,8 @@ def _guess(path: Path, front: bytes) -> str:
         return f"; it is PulseWaves: `wavebatch import {path}` makes a strip of it" + f", or give {strip}" * bool(strip)
     if path.suffix.lower() in (".wdp", ".wdz"):
         return f"; it has the packets of {strip or path.with_suffix('.las')}: give that file"
+    if path.suffix.lower() == ".npz":
+        return "; it is a file of arrays, as `voxelize`, `slice --cube` and `simulate --truth` write them"
     if front.startswith((b"\x1f\x8b", b"PK\x03\x04", b"7z\xbc\xaf", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")):
         return "; it is a compressed file or an archive (gzip, ZIP, 7z, bzip2, xz or zstd): unpack it first"
     text = path.suffix.lower() in (".txt", ".lst", ".list", ".csv") or not front
