@@ -28,7 +28,7 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.direct import TWICE_SMOOTHED_GAIN, maximum
 from wavebatch.stages.detect.transformed import asdf
 from wavebatch.stages.score import match_echoes
-from wavebatch.tools.simulate import simulate_block
+from wavebatch.tools.simulate import shape_pulse, simulate_block
 from wavebatch.tools.simulate.scenes import LogNormal
 
 PAPER_RULE = {"rule": "paper", "interpolation": "parabola"}
@@ -70,7 +70,7 @@ Strip = tuple[WaveformBlock, EchoTable, Noise, SystemPulse]
 
 def simulate(number: int, seed: int, ringing: float = 0.0) -> Strip:
     """The waveforms of the tables, with lobes of -ringing and +ringing after every echo."""
-    recording = replace(WAGNER.recording, pulse=WAGNER.recording.pulse.with_ringing(ringing))
+    recording = replace(WAGNER.recording, pulse=shape_pulse(WAGNER.recording.pulse, ringing=ringing))
     block, truth = simulate_block(WAGNER, number, np.random.default_rng(seed), recording=recording)
     return block, truth, known_noise(recording, number), known_system(recording)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
-from wavebatch.tools.simulate import PulseModel, Recording, Scene
+from wavebatch.tools.simulate import PulseModel, Recording, Scene, shape_pulse
 from wavebatch.tools.simulate.scenes import (
     Draw,
     Drawn,
@@ -106,7 +106,7 @@ def _list_cases() -> Iterator[Case]:
     yield Case("H6", "clipped at 50%, none in the survey", partial(draw_clipped, level=0.5), base)
     yield Case("H6", "5 to 500 times the range", draw_huge, clipping)
     for ring in (0.01, 0.02, 0.03):
-        ringing = replace(base, pulse=base.pulse.with_ringing(ring))
+        ringing = replace(base, pulse=shape_pulse(base.pulse, ringing=ring))
         yield Case("H7", f"ringing {ring:.0%}", one(heights=(200.0,)), ringing)
     for inside in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5):
         yield Case("H8", f"centre {inside:g} s inside", partial(draw_at_edge, inside=inside), base)

@@ -30,7 +30,7 @@ from wavebatch.surveying.systems.known_systems import (
     known_systems,
 )
 from wavebatch.surveying.systems.survey_result import load_survey
-from wavebatch.tools.simulate import PulseModel, find_pulse
+from wavebatch.tools.simulate import PulseModel, find_pulse, shape_pulse
 
 
 @pytest.mark.quick_cases("4.0")
@@ -448,7 +448,7 @@ def test_few_isolated_echoes_are_a_guess_where_pulses_do_not_agree(waveforms, wi
 OTHERS = {
     "narrow": PulseModel(1.85), "wide": PulseModel(3.4), "skewed": PulseModel(1.9, kappa=-0.1),
     "very skewed": PulseModel(3.4, kappa=0.2), "simulated riegl": find_pulse("riegl"),
-    "simulated leica": find_pulse("leica"), "ringing": PulseModel(1.85).with_ringing(0.04),
+    "simulated leica": find_pulse("leica"), "ringing": shape_pulse(PulseModel(1.85), ringing=0.04),
     "early after-pulse": PulseModel(1.85, 0.0, ((0.04, 8.0, 1.8),)), "tail": PulseModel(1.85, 0.0, ((0.05, 4.0, 4.0),)),
 }  # fmt: skip
 

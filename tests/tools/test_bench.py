@@ -217,6 +217,14 @@ def test_tally_measures_what_was_put_in():
     assert gross.figures()["gross_isolated"].value == 1
 
 
+def test_widths_are_those_of_their_column():
+    group, tally = known_group(), accuracy.AccuracyTally()
+    width = np.float32(2.354820) * group.truth.sigma
+    found = replace(group.truth, sigma=2 * group.truth.sigma)
+    tally.add(group, found.with_attributes(echo_width=width, echo_width_err=0.1 * width))
+    assert tally.figures()["sigma_ratio_isolated"].value < 0.01
+
+
 def test_reported_errors_are_measured_with_and_without_flags():
     """Every second echo is flagged and off by three of its errors, the others by one."""
     group, tally = known_group(), accuracy.AccuracyTally()

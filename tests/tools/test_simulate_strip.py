@@ -289,7 +289,7 @@ def test_samples_hold_the_truth(name):
 @pytest.mark.parametrize("name", list(render.PULSES))
 @pytest.mark.parametrize(("ringing", "factor"), [(0.0, 1.0), (0.03, 1.0), (0.03, 1.7)])
 def test_every_pulse_peaks_at_the_amplitude(name, ringing, factor):
-    pulse = find_pulse(name).with_ringing(ringing)
+    pulse = shape_pulse(find_pulse(name), ringing=ringing)
     recording, sigma = Recording(n_samples=4000, spacing=0.02, pulse=pulse), np.array([pulse.sigma * factor])
     signal = render.paint_echoes(recording, 1, np.array([0]), np.array([30.0]), np.array([100.0]), sigma)[0]
     assert signal.max() == pytest.approx(100, rel=1e-3)

@@ -19,7 +19,7 @@ import click
 from wavebatch.batch.options import OPTIONS, RunOptions
 from wavebatch.cli import messages
 from wavebatch.cli import options as shared
-from wavebatch.core.errors import WARNINGS, ConfigError, InputError, StripWarning, nearest
+from wavebatch.core.errors import OF_FILES, WARNINGS, ConfigError, InputError, nearest
 from wavebatch.core.process import importing
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_input
@@ -82,7 +82,7 @@ class Progress(Closing):
         elif kind in ("written", "incomplete"):
             self._tell(_summary(event, self._level > 0))
             for one in event["warnings"]:
-                say = self._say if StripWarning(**one).is_loud else self._tell
+                say = self._tell if one["code"] in OF_FILES else self._say
                 say(messages.printable(f"{strip}: warning: {one['text']}"))
             chosen = [f"{one['part']}: {'yes' if one['needed'] else 'no'}: {one['reason']}"
                       for one in event["decisions"]]  # fmt: skip

@@ -65,8 +65,9 @@ WARNINGS = {
 }
 """What makes results of a strip doubtful, by a code that stays the same in later versions."""
 
-_OF_FILES = ("header", "packets", "dropped-records")
-"""Codes of what is odd about a file, while the results are as good as usual."""
+OF_FILES = ("header", "packets", "dropped-records")
+"""Codes of what is odd about a file, while the results are as good as usual: --quiet hides them. Others say that what
+is written is less sure, or less, than its inputs promise."""
 
 
 @frozen(order=True)
@@ -84,11 +85,6 @@ class StripWarning:
     def of(cls, code: str, lines: Iterable[str]) -> tuple[StripWarning, ...]:
         """Return a warning for each line."""
         return tuple(cls(code, line) for line in lines)
-
-    @property
-    def is_loud(self) -> bool:
-        """Whether it is printed with --quiet too: what is written is less sure, or less, than its inputs promise."""
-        return self.code not in _OF_FILES
 
 
 PACKAGES = {

@@ -156,13 +156,6 @@ class PulseModel:
     lobes: tuple[tuple[float, float, float], ...] = ()
     """(height relative to the main lobe, delay [ns], sigma [ns]) of every further lobe."""
 
-    def with_ringing(self, share: float) -> PulseModel:
-        """The pulse with a lobe of -share at 4 sigma and +share at 8 sigma after its peak."""
-        if share == 0:
-            return self
-        ring = ((-share, 4 * self.sigma, self.sigma), (share, 8 * self.sigma, self.sigma))
-        return replace(self, lobes=self.lobes + ring)
-
 
 LEAST_SIGMA = 0.001
 """Shortest pulse [ns]: no detector shows 1 ps, and times in units of far shorter ones overflow."""
@@ -194,7 +187,7 @@ def shape_pulse(
     """The system pulse `old` with the given values replaced.
 
     pulse: name of a shape in PULSES; those of real sensors replace sigma too. sigma [ns], kappa: width and skew of the
-    main lobe. ringing: share of the amplitude in lobes 4 and 8 sigma after the peak.
+    main lobe. ringing: share of the amplitude in lobes 4 (below the level) and 8 sigma after the peak.
     Raises ConfigError for an unknown name or a value out of range.
     """
     shape = old if pulse is None else find_pulse(pulse)
@@ -203,7 +196,8 @@ def shape_pulse(
     if not (LEAST_SIGMA <= width < 1000 and abs(skew) <= 0.5 and abs(ringing) <= 0.5):
         limits = f"above 0 ({LEAST_SIGMA} to 1000)"
         raise ConfigError(f"pulse: sigma {width} ns must be {limits}, kappa {skew} and ringing {ringing} within +-0.5")
-    return replace(shape, sigma=width, kappa=skew).with_ringing(ringing)
+    ring = ((-ringing, 4 * width, width), (ringing, 8 * width, width)) if ringing else ()
+    return replace(shape, sigma=width, kappa=skew, lobes=shape.lobes + ring)
 
 
 def spread_lobes(
