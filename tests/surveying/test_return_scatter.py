@@ -63,6 +63,31 @@ def test_the_scatter_of_points_is_measured(tmp_path, scatter):
     assert found.phase == pytest.approx(scatter, rel=0.15)  # these locations have no phase
 
 
+def test_rounded_coordinates_are_in_the_scatter(tmp_path, edit_points):
+    """Locations knew returns to 1 mm, whose coordinates are multiples of half a metre."""
+
+    def round_places(points):
+        points["Z"] = 500 * np.round(points["Z"] / 500.0)
+        return points
+
+    write_strip(tmp_path / "a.las", TOWN, Flight(point_error=0.005), 3000, 3)
+    found = measure(edit_points(tmp_path / "a.las", tmp_path / "b.las", round_places))
+    assert found.source == "rounding" and found.scatter == pytest.approx(0.5 / 12.0**0.5)
+
+
+@pytest.mark.parametrize(("wrong", "phase"), [(1.0, 1.5), (0.3, 0.005)], ids=["most", "some"])
+def test_locations_that_are_wrong_are_in_the_phase(tmp_path, edit_points, wrong, phase):
+    """10 ns too late in all packets: echoes were 1.5 m off with errors of 1 mm, since no return was at an echo."""
+
+    def delay(points):
+        late = np.random.default_rng(1).random(len(points)) < wrong
+        points["return_point_wave_location"] += 1e4 * late.astype("f4")
+        return points
+
+    write_strip(tmp_path / "a.las", TOWN, Flight(point_error=0.005), 3000, 3)
+    assert measure(edit_points(tmp_path / "a.las", tmp_path / "b.las", delay)).phase == pytest.approx(phase, rel=0.2)
+
+
 def test_scatter_and_phase_are_printed_and_in_the_report(tiny_strip, tmp_path):
     done = run_command("run", tiny_strip, "-o", tmp_path, "-v", "--profile", "fast")
     found = json.loads((tmp_path / f"{tiny_strip.stem}.report.json").read_text())["strip"]["sensor"]["returns"]
@@ -107,8 +132,8 @@ def test_no_packet_of_a_small_strip_counts_twice(tmp_path):
     with StripReader(tmp_path / "a.las") as reader, reader.scan() as scan:
         parts = list(_sample(reader, scan, wb.survey(tmp_path / "a.las").system))
     for kind in zip(*parts, strict=True):
-        residuals = np.concatenate(kind, axis=1)
-        assert residuals.shape == np.unique(residuals, axis=1).shape
+        residuals = np.concatenate(kind, axis=-1)
+        assert residuals.shape == np.unique(residuals, axis=-1).shape
 
 
 def test_a_phase_of_the_pulse_is_no_scatter(tiny_strip):

@@ -37,6 +37,10 @@ LOWEST, LOWEST_OF_NORMAL = 1 / 3, 0.4307
 """Share of the smallest residuals that count, since edges and plants only enlarge them; and the largest of these, over
 the standard deviation, for normal residuals."""
 
+ROUNDED, LEAST_ROUNDING = 2048, 1e-3
+"""Points that show to what coordinates are rounded, since a common divisor of so many is no chance; and the least that
+counts [m]: millimetres are usual."""
+
 BETWEEN = (0.2, 0.8)
 """Where a return lies between its two neighbours, as a share of their distance: elsewhere a scan line ends."""
 
@@ -52,7 +56,7 @@ class ReturnScatter(NamedTuple):
     phase: float = 0.0
     """Root mean square of the difference between locations and echoes [m]: of echoes without a return."""
     source: str = "assumed"
-    """`neighbours`, `pairs of returns`, `locations` or `assumed`."""
+    """`neighbours`, `pairs of returns`, `locations`, `rounding` of the coordinates, or `assumed`."""
 
 
 def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -> ReturnScatter:
@@ -70,21 +74,34 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
     ReturnScatter
         The smallest of three scatters, each less the errors of the fits. Neighbours: single returns of clear echoes
         off the line between the returns before and after them; it holds the roughness of the ground. Pairs of returns
-        of a packet, against the fits. Locations of returns against the fits; it holds the phase.
+        of a packet, against the fits. Locations of returns against the fits; it holds the phase. Coordinates that are
+        rounded to more than that count instead.
     """
     parts = list(_sample(reader, scan, system))
     if not parts:
         return ReturnScatter()
-    neighbours, pairs, offsets = (np.concatenate(kind, axis=1) for kind in zip(*parts, strict=True))
-    phase = HALF_C * float(np.sqrt(np.mean(offsets[0] ** 2))) if offsets.size else 0.0
+    neighbours, pairs, offsets, astray = (np.concatenate(kind, axis=-1) for kind in zip(*parts, strict=True))
+    # Where most lone returns are not at the lone echo of their packet, locations are wrong, and not some echoes.
+    if len(astray) > offsets.shape[1]:
+        phase = HALF_C * float(median(np.abs(astray)))
+    else:
+        phase = HALF_C * float(np.sqrt(np.mean(offsets[0] ** 2))) if offsets.size else 0.0
     offsets[0] -= median(offsets[0]) if offsets.size else 0.0
     kinds = {"neighbours": neighbours, "pairs of returns": pairs, "locations": offsets}
     found = {name: _measure(residuals) for name, residuals in kinds.items()}
     known = {name: HALF_C * scatter for name, scatter in found.items() if scatter is not None}
-    if not known:
-        return ReturnScatter(phase=phase)
-    source = min(known, key=known.__getitem__)
-    return ReturnScatter(known[source], phase, source)
+    source = min(known, key=known.__getitem__, default="assumed")
+    rounding, scatter = _measure_rounding(reader, scan), known.get(source, RETURNS)
+    if rounding > max(scatter, LEAST_ROUNDING):
+        return ReturnScatter(rounding, phase, "rounding")
+    return ReturnScatter(scatter, phase, source)
+
+
+def _measure_rounding(reader: StripReader, scan: StripScan) -> float:
+    """Standard deviation of what rounding takes off the coarsest coordinate: locations do not show it [m]."""
+    points = reader.read_points(0, int(min(scan.borders[-1], ROUNDED)), scan)
+    steps = [np.gcd.reduce(np.diff(points[name].astype(np.int64))) for name in "XYZ"] if len(points) > LEAST else [0]
+    return float(np.max(np.multiply(steps, reader.facts.header.scales[: len(steps)]))) / 12.0**0.5
 
 
 def _measure(residuals: np.ndarray) -> float | None:
@@ -104,7 +121,8 @@ def _measure(residuals: np.ndarray) -> float | None:
 
 
 def _sample(reader: StripReader, scan: StripScan, system: SystemPulse) -> Iterator[tuple[np.ndarray, ...]]:
-    """Residuals of runs of packets (3, k), as for `_measure`: of neighbours, pairs and locations [ns]."""
+    """Residuals of runs of packets (3, k), as for `_measure`: of neighbours, pairs and locations [ns]; and by how much
+    lone echoes differ from the lone return of their packet, where that is not theirs (k,)."""
     chosen = even_places(reader.unit_count(), RUNS).tolist()
     for number in chosen:
         unit = reader.read_unit(number, scan)
@@ -136,7 +154,11 @@ def _compare(
     pairs = np.stack([np.diff(offset)[two], np.full(len(two), 2.0), np.hypot(error[two], error[two + 1])])
     offsets = np.stack([offset, np.ones(len(rows)), error])
 
-    lone = echoes.alone(len(block))[rows] & (np.bincount(returns.waveform, minlength=len(block))[waveform] == 1)
+    number = np.bincount(returns.waveform, minlength=len(block))
+    alone = echoes.alone(len(block)) & (number[echoes.waveform] == 1)
+    first = (np.cumsum(number) - number)[echoes.waveform]
+    astray = (echoes.time - returns.time[np.where(alone, first, 0)])[alone & (match < 0)]
+    lone = alone[rows]
     waveform, error, place = waveform[lone], error[lone], returns.xyz[match[rows[lone]]]
     order = np.lexsort((block.gps_time[waveform], run[waveform]))
     error, place, run, ray = error[order], place[order], run[waveform[order]], block.direction[waveform[order]][1:-1]
@@ -150,4 +172,4 @@ def _compare(
     before, after = (1.0 - share) ** 2, share**2
     fits = np.sqrt(error[1:-1] ** 2 + before * error[:-2] ** 2 + after * error[2:] ** 2)
     neighbours = np.stack([off, 1.0 + before + after, fits])[:, between]
-    return neighbours, pairs, offsets
+    return neighbours, pairs, offsets, astray
