@@ -352,15 +352,6 @@ def test_errors_hold_in_coloured_noise_that_grows_with_the_signal(rho, gain):
     assert true > 0.995
 
 
-def test_photons_are_no_echoes():
-    """A hundred photons at the peak of 800 echoes: of fits by white noise too few stayed single to show the growth."""
-    signal, rows, time, _ = render(bell, 24, n=800, s=64, amplitude=(10, 120), width=1.3, second=0.3)
-    counts = BASE + 0.7 * np.random.default_rng(24).poisson(signal / 0.7)
-    system, echoes = decompose(digitize(counts - BASE, 24))
-    assert system.noise.gain == pytest.approx(0.7, rel=0.25) and not system.defects
-    assert compare(echoes, rows, time)[1] > 0.99
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.05, 0.3])
 def test_noise_that_grows_with_the_signal_makes_no_narrow_pulse(gain):

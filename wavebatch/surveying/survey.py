@@ -49,7 +49,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_empty,
     thin_samples,
 )
-from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, find_overgrown, measure_residuals
+from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
@@ -212,9 +212,6 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
     if guessed:  # too few echoes stand alone to know how far signal reaches
         begin = measure_whole(block, begin)
     found = measure_defects(block, begin)
-    if found.defects.spikes and find_overgrown(block, begin, find_clear(block, begin)):
-        # Noise that grows so with the signal has samples of its own that stand out.
-        found = replace(found, defects=replace(found.defects, spikes=0.0))
     if not found.defects:
         return block, begin if guessed else measure_whole(block, begin)
     block = clean_block(block, found)
@@ -227,9 +224,6 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     candidates: tuple[Tried, ...] = ()
     if learn:
         clear = find_clear(block, system)
-        grown = 0.0 if system.noise.gain else find_overgrown(block, system, clear)
-        if grown:
-            return _survey(block, measure_again(block, first, grown), learn=learn)
         main = find_isolated(block, system, clear)
         figures.isolated_echoes = len(main)
         starts = {"gaussian": system}

@@ -51,11 +51,6 @@ BROUGHT, BROUGHT_CROSS = np.sqrt(2 / 3) * np.array([1, 2 / 3, 1 / 2]), -np.sqrt(
 """Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first
 and the third one, times 2 / sqrt(2) as it enters the sum."""
 
-LEAST_GROWN, OVERGROWN = 500, 20.0
-"""Samples under echoes from which the growth of noise is looked for. And variance under strong echoes, over that
-without signal, from which fits by white noise split so many that those left alone do not show it: lone echoes, each
-fitted as one, tell it first. (Of pulses that are no Gaussians these have shown up to 7 where noise does not grow.)"""
-
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
 fits leave at no signal."""
@@ -170,7 +165,7 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     hold the pulse's misfit, which is none: they decide only where quiet samples never leave one count
     (docs/algorithms.md R3, H10, H12).
     """
-    n = len(block)
+    n, s = block.samples.shape
     if not system.noise.by_kind["quiet"]:
         system = _measure_outside(block, system, echoes)
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
@@ -182,7 +177,13 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
         alone = replace(again, waveform=alone.waveform[again.waveform])
     if len(alone) < ENOUGH_TO_LEARN:
         return system
-    residual, model, lag, width = _look_under(block, system, alone)
+    time, width = alone.time / block.spacing, alone.sigma / block.spacing
+    rows = np.arange(len(alone), dtype=np.int32)
+    part = block.rows(alone.waveform)
+    model = render_own(block, system, alone, rows, len(alone))
+    residual = subtract_echoes(part, system, replace(alone, waveform=rows.astype(np.int32)), model)
+    lag = (np.arange(s) - time[:, None]) / width[:, None]
+    lag[~np.isfinite(residual)] = np.inf
     kinds = dict(system.noise.by_kind)
     kinds["core"] = _robust_std(residual[np.abs(lag) < 2.5])
     std = system.noise.std
@@ -193,30 +194,6 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     sample = kinds.get("outside") or kinds["quiet"] or std
     gain = _noise_gain(residual, model, lag, width, std, std > COLOURED * sample)
     return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=gain))
-
-
-def _look_under(
-    block: WaveformBlock, system: SystemPulse, alone: EchoTable
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What is left of the waveforms of m single echoes, these echoes, lags from them [widths], and widths [samples]."""
-    rows, part = np.arange(len(alone), dtype=np.int32), block.rows(alone.waveform)
-    model = render_own(block, system, alone, rows, len(alone))
-    residual = subtract_echoes(part, system, replace(alone, waveform=rows), model)
-    width = alone.sigma / block.spacing
-    lag = (np.arange(residual.shape[1]) - (alone.time / block.spacing)[:, None]) / width[:, None]
-    lag[~np.isfinite(residual)] = np.inf
-    return residual, model, lag, width
-
-
-def find_overgrown(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> float:
-    """Growth of the noise with the signal, per count, by lone echoes that were fitted as Gaussians; 0 if OVERGROWN is
-    not reached.
-    """
-    if len(lone) < ENOUGH_TO_LEARN:
-        return 0.0
-    std = system.noise.std
-    gain = _noise_gain(*_look_under(block, replace(system, components=(), kappa=0.0), lone), std, False)
-    return gain if gain * quantile(lone.amplitude, 0.9) > OVERGROWN * std**2 else 0.0
 
 
 def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
@@ -376,7 +353,7 @@ def _noise_gain(
     squared = ((values - common) * np.sqrt(number / np.maximum(number - 1, 1))) ** 2 / (1 - taken)
     # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
     signal = (model[core].astype(np.float64) * (1 - 2 * taken) + height * brought) / (1 - taken)
-    if len(signal) < LEAST_GROWN:
+    if len(signal) < 2000:
         return 0.0
     edges = quantiles(signal, np.linspace(0, 1, 13))
     place = np.clip(np.searchsorted(edges, signal) - 1, 0, 11)
