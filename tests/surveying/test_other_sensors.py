@@ -290,6 +290,18 @@ def test_a_pulse_that_another_one_had_replaced_may_beat_its_successor():
     assert choose_pulse._decide([found[0], found[2]]).best.name == "first"
 
 
+def test_a_known_pulse_gives_way_to_what_beats_it_itself():
+    """A wide one beats it, by half a nat; one as wide as the known one saves a nat of the two that are asked for."""
+    spread = 0.1 * np.resize([1.0, -1.0], 400)
+    rows = ("known", 1.0, 2.0, True, 2), ("wide", 0.5, 2.4, False, 6), ("near", 0.0, 2.05, False, 6)
+    found = [
+        choose_pulse.Candidate(name, SystemPulse(width), 0.0, 50 + more + k * spread, 400, 400, known, gaussians, 0.0)
+        for k, (name, more, width, known, gaussians) in enumerate(rows)
+    ]
+    assert choose_pulse._decide(found).best.name == "known"
+    assert choose_pulse._decide(found[:2]).best.name == "wide" and choose_pulse._decide(found[1:]).best.name == "near"
+
+
 @pytest.mark.parametrize(("answered", "doubted"), [(16, True), (100, False)])
 def test_fewer_echoes_that_lose_for_want_of_waveforms_are_a_doubt(answered, doubted):
     """By 4 errors: many waveforms would have asked for 4.5, which so few cannot show."""

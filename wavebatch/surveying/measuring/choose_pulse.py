@@ -105,6 +105,9 @@ OF_ALL, OF_ANY, AGAIN = "gaussian of all echoes", "all echoes", ", again"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, OF_ANY: {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
 
+ALONE = 256
+"""Waveforms with one echo from which the pulse is learned jointly, at most: as many as judge candidates by half."""
+
 MORE_ROUNDS = 8
 """Further rounds of all echoes, at most: each goes a part of the way, and five reached a pulse that was a sixth off."""
 
@@ -241,6 +244,29 @@ def choose_pulse(
     return choice if small else replace(choice, best=_learn_from_all(part, choice.best))
 
 
+def learn_alone(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
+    """Learn the pulse from waveforms with one echo each, in two rounds from one that a stack of them shows.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Of isolated echoes.
+    system : SystemPulse
+        With a pulse learned from their stack, which lies as a Gaussian fits each of them: the shape of a skewed pulse,
+        or of one hardly wider than the samples, moves that from echo to echo.
+
+    Returns
+    -------
+    SystemPulse
+        With the new pulse. What it misses has become no further echo: each waveform has one.
+    """
+    part = thin_block(block, ALONE)
+    for last in (False, True):
+        explained = explain(part, bear(system, CHANGES[1]), max_echoes=1)
+        system = learn_jointly(part, system, explained, CHANGES[1], last=last)
+    return system
+
+
 def _learn_from_all(block: WaveformBlock, best: Candidate) -> Candidate:
     """The chosen pulse, where it was learned from half of these waveforms, learned from all of them."""
     name = best.name.removesuffix(AGAIN)
@@ -366,9 +392,13 @@ def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
         first = min((one for one in level if AS_FEW * one.echoes <= fewest), key=lambda one: (one.typical, one.name))
         ordered += [first, *(one for one in alike if one is not first)]
     best = ordered[0]
+    replaced: list[Candidate] = []
     for one in 2 * ordered:  # twice: that one beats the next, and this a third, says nothing of the first and the third
         if _beats(one, best):
+            replaced.append(best)
             best = one
+    # A known pulse gives way to what beats it itself: a wide one did, and a third as wide as the known one beat that.
+    best = next((one for one in replaced if one.known and not _beats(best, one)), best)
     tied = [one for one in ordered if one.exceeds(best) < SURE]
     # Fewer echoes lost by less than many waveforms would ask for, or than waveforms that were learned from can show.
     most = SURE + HINT if SHOWN * np.sqrt(best.answered) < SURE + HINT else SURE
