@@ -233,7 +233,7 @@ def choose_pulse(
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
     found = _try_changes(held, found if plain else found + _learn(taught, held, begin))
     choice = _decide(found, small=small)
-    if abs(choice.best.system.sigma_ref / begin.system.sigma_ref - 1) > OTHER_WIDTH and choice.best.name in starts:
+    if choice.best.name in starts and not _is_as_wide(choice.best, begin):
         # Few waveforms showed another start: what was learned from it may be of another pulse.
         again = [replace(one, name=one.name + AGAIN) for one in _learn(taught, held, choice.best)]
         found += _try_changes(held, again)
@@ -397,8 +397,8 @@ def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
         if _beats(one, best):
             replaced.append(best)
             best = one
-    # A known pulse gives way to what beats it itself: a wide one did, and a third as wide as the known one beat that.
-    best = next((one for one in replaced if one.known and not _beats(best, one)), best)
+    # One of its width must beat a known pulse itself: a wide one did, and this one beat that.
+    best = next((one for one in replaced if one.known and _is_as_wide(one, best) and not _beats(best, one)), best)
     tied = [one for one in ordered if one.exceeds(best) < SURE]
     # Fewer echoes lost by less than many waveforms would ask for, or than waveforms that were learned from can show.
     most = SURE + HINT if SHOWN * np.sqrt(best.answered) < SURE + HINT else SURE
@@ -436,10 +436,14 @@ def _save(shorter: Candidate, longer: Candidate) -> float:
     return (longer.typical - shorter.typical) * len(longer.length) / max(longer.echoes, 1)
 
 
+def _is_as_wide(one: Candidate, other: Candidate) -> bool:
+    return abs(one.system.sigma_ref / other.system.sigma_ref - 1) <= OTHER_WIDTH
+
+
 def _beats(shorter: Candidate, longer: Candidate) -> bool:
     """Whether a candidate describes so much shorter that it is taken in place of the other."""
     least = LEAST_SAVED if longer.gaussians == 1 < shorter.gaussians else 0.0
-    if longer.known and not shorter.known and abs(shorter.system.sigma_ref / longer.system.sigma_ref - 1) < OTHER_WIDTH:
+    if longer.known and not shorter.known and _is_as_wide(shorter, longer):
         least = LEAST_OF_KNOWN
     return _save(shorter, longer) > least and longer.exceeds(shorter) > _bound_errors(shorter, longer)
 
