@@ -33,7 +33,7 @@ def slope(rng, n, degrees, noise=0.02, side=1.5):
 
 
 def naive_plane(xyz):
-    """fit_planes of one set: points that count, by a loop with singular values and sorted distances."""
+    """fit_planes of one set: points that count, by a loop with singular values and sorted distances; their limit."""
     kept = np.ones(len(xyz), bool)
     for number in range(8):
         centre = xyz[kept].mean(axis=0)
@@ -49,7 +49,7 @@ def naive_plane(xyz):
         kept = near
     centre = xyz[kept].mean(axis=0)
     _, singular, axes = np.linalg.svd(xyz[kept] - centre, full_matrices=False)
-    return kept.sum(), axes[2], np.sort(singular**2 / kept.sum())
+    return kept.sum(), axes[2], np.sort(singular**2 / kept.sum()), factor * middle
 
 
 def test_many_planes_at_once_are_those_of_a_loop(rng):
@@ -60,10 +60,11 @@ def test_many_planes_at_once_are_those_of_a_loop(rng):
     group = np.repeat(np.arange(len(sets)), [len(xyz) for xyz in sets])
     planes = fit_planes(np.concatenate(sets), group, len(sets))
     for number, xyz in enumerate(sets):
-        kept, normal, spreads = naive_plane(xyz)
+        kept, normal, spreads, limit = naive_plane(xyz)
         assert planes.kept[number] == kept
         assert abs(planes.normal[number] @ normal) == pytest.approx(1, abs=1e-9)
         assert planes.spreads[number] == pytest.approx(spreads, rel=1e-6, abs=1e-12)
+        assert planes.limit[number] == pytest.approx(limit, rel=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [0, 1, 10, 60])

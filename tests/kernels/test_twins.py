@@ -240,7 +240,7 @@ def test_coloured_noise_widens_errors_as_its_covariance_says():
 
 
 def test_sums_of_coloured_samples_vary_as_their_matrix_says(rng):
-    for correlation, size in (((0.5, 0.2), 7), ((0.6, 0.0, 0.1, -0.1), 3), ((), 4), ((0.9,), 1)):
+    for correlation, size in (((0.5, 0.2), 7), ((0.6, 0.3, 0.1, -0.1), 3), ((), 4), ((0.9,), 1)):
         rows = rng.standard_normal((3, size))
         matrix = toeplitz(np.r_[1.0, correlation, np.zeros(size)][:size])
         assert noise_kernels.coloured_variance(rows, correlation) == pytest.approx([row @ matrix @ row for row in rows])

@@ -326,6 +326,34 @@ def test_a_pulse_looks_too_good_to_the_waveforms_that_taught_it(errors, small, d
     assert choice.best is learned and choice.doubt == pytest.approx(doubt)
 
 
+@pytest.mark.parametrize(
+    ("lengths", "unsteady", "taken"),
+    [
+        ((60, 58, 56, 57), 0, 3), ((60, 58, 57.9, 50), 0, 3), ((60, 58, 57, 50), 3, 3), ((60, 58, 57, 50), 0, 4),
+        ((60, 58.1, 58.2, 50), 2, 2),
+    ],
+)  # fmt: skip
+def test_rounds_of_all_echoes_end_where_none_is_surely_shorter(monkeypatch, lengths, unsteady, taken):
+    """Of them the shortest is taken. One round gains a nat by one standard error: a further one is not looked at."""
+
+    def judge_round(block, name, system, change, known):
+        number = int(system.sigma_ref)
+        spread = (20 if number == unsteady else 0.1 * number) * np.resize([1.0, -1.0], 400)
+        length = lengths[min(number, len(lengths)) - 1] + spread
+        return choose_pulse.Candidate(name, system, change, length, 400, 400, known, 1, 0.0)
+
+    rounds = [("one", SystemPulse(1.0)), (choose_pulse.OF_ANY, SystemPulse(2.0))]
+    monkeypatch.setattr(choose_pulse, "_list_rounds", lambda *a: rounds)
+    monkeypatch.setattr(choose_pulse, "_judge", judge_round)
+    monkeypatch.setattr(choose_pulse, "explain", lambda *a, **k: None)
+    monkeypatch.setattr(
+        choose_pulse, "learn_jointly", lambda block, system, *a, **k: replace(system, sigma_ref=system.sigma_ref + 1)
+    )
+    begin = choose_pulse.Candidate("", SystemPulse(1.0), 0.0, np.ones(400), 400, 400, False, 1, 0.0)
+    found = choose_pulse._learn(None, None, begin)
+    assert [one.system.sigma_ref for one in found] == [1, taken]
+
+
 @pytest.mark.parametrize("name", [choose_pulse.OF_ALL, *choose_pulse.ROUNDS])
 def test_what_was_learned_again_is_learned_from_all_waveforms_too(name):
     block = record(gaussian, 5, n=60)[0]

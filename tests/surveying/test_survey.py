@@ -445,6 +445,22 @@ def test_few_isolated_echoes_are_a_guess_where_pulses_do_not_agree(waveforms, wi
     assert len(list(doubt_survey(system, figures, waveforms))) == said
 
 
+@pytest.mark.parametrize(
+    ("made", "waveforms", "alone", "echoes", "code"),
+    [
+        (0.05, 100, 50, 0.0, "noise-guess"), (0.02, 500, 50, 0.0, None), (0.05, 60, 50, 0.0, None),  # 3 such echoes
+        (0.05, 500, 50, 0.4, "pulse-guess"), (0.05, 60, 5, 0.4, "pulse-guess"),
+    ],
+)  # fmt: skip
+def test_echoes_of_noise_are_a_guess_of_it_unless_the_pulse_is_one(made, waveforms, alone, echoes, code):
+    figures = Figures(isolated_echoes=alone, width_in_doubt=0.0, echoes_in_doubt=echoes, echoes_per_waveform=1.0,
+                      false_in_noise_share=made)  # fmt: skip
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0, by_kind={"quiet": 1.0}))
+    doubts = list(doubt_survey(system, figures, waveforms))
+    assert [one.code for one in doubts] == ([code] if code else [])
+    assert all(("noise made" in one.text) == ("the noise is a guess" in one.text) for one in doubts)
+
+
 OTHERS = {
     "narrow": PulseModel(1.85), "wide": PulseModel(3.4), "skewed": PulseModel(1.9, kappa=-0.1),
     "very skewed": PulseModel(3.4, kappa=0.2), "simulated riegl": find_pulse("riegl"),

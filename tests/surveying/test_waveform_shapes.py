@@ -11,12 +11,13 @@ from wavebatch.core.waveforms import Defects, ReceiverNoise, SystemPulse, Wavefo
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.defects import find_spikes
 from wavebatch.stages.chain import STAGES, load_profile
-from wavebatch.stages.clean import clean_block
+from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.measuring.joint_pulse import stack_jointly
 from wavebatch.surveying.measuring.judge import explain
+from wavebatch.surveying.measuring.noise_and_width import thin_empty
 from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
 from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey, parse_survey
 
@@ -186,6 +187,14 @@ def test_spikes_of_one_sample_are_no_echoes_of_a_narrow_pulse():
     system, found, true = scores(digitize(signal, 15), rows, time)
     assert system.defects.spikes == pytest.approx(0.25, rel=0.3)
     assert found > 0.985 and true > 0.97
+
+
+@pytest.mark.parametrize(("width", "told"), [(1.15, False), (1.25, True)])
+def test_spikes_are_told_from_echoes_of_wider_pulses_only(width, told):
+    signal = render(bell, 15, n=200, s=64, width=width)[0]
+    signal[::4, 50] += 40
+    noise = ReceiverNoise(baseline=BASE, std=0.76, by_kind={"quiet": 0.76})
+    assert (measure_defects(digitize(signal, 15), SystemPulse(width, noise=noise)).defects.spikes > 0) == told
 
 
 @pytest.mark.parametrize("bits", [8, 12, 16])
@@ -503,6 +512,15 @@ def test_a_pulse_is_chosen_by_the_waveforms_that_hold_echoes():
     signal[rows % 100 > 0] = 0
     system, echoes = decompose(digitize(signal, 12))
     assert system.sigma_ref == pytest.approx(2.0, rel=0.02) and 15 <= len(echoes) <= 17  # of noise, in 120,000 samples
+
+
+@pytest.mark.parametrize(("step", "left"), [(10, 30 + 120), (50, 300), (4, 300)])  # 6 with signal are too few
+def test_four_empty_waveforms_are_kept_for_each_with_an_echo(step, left):
+    samples = np.full((300, 40), 12, np.uint8)
+    samples[::step, 20] = 90
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0))
+    kept = thin_empty(WaveformBlock.from_samples(samples), system).samples
+    assert len(kept) == left and np.count_nonzero(kept == 90) == len(samples[::step])
 
 
 @pytest.fixture(scope="module")

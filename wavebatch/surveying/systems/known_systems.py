@@ -284,8 +284,9 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     if hidden and not reason:
         reason, remedy = "most of the noise below count 0", "raise the level of the digitizer in the next flight"
     made = figures.false_in_noise_share or 0.0
-    noisy = made > MADE_BY_NOISE and made * waveforms * (figures.echoes_per_waveform or 0.0) >= LEAST_MADE
-    if noisy and not reason:
+    many = made * waveforms * (figures.echoes_per_waveform or 0.0) >= LEAST_MADE
+    noisy = not reason and made > MADE_BY_NOISE and many
+    if noisy:
         reason = f"that noise made {100 * made:.0f} of 100 echoes"
         remedy = "it may differ between waveforms, or baselines are not level: draw some with `wavebatch plot waveform`"
     if reason:
