@@ -17,7 +17,7 @@ from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
-from wavebatch.surveying.measuring.choose_pulse import bear, choose_pulse, learn_alone, settle
+from wavebatch.surveying.measuring.choose_pulse import JOINTLY, STACKED, bear, choose_pulse, learn_alone, settle
 from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse, measure_skew
 from wavebatch.surveying.measuring.misfit import (
@@ -228,15 +228,15 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.isolated_echoes = len(main)
         starts = {"gaussian": system}
         if len(main) >= ENOUGH_TO_LEARN:
-            starts["lone echoes"] = learn_pulse(block, system, clear, main, figures)
+            starts[STACKED] = learn_pulse(block, system, clear, main, figures)
         else:
             guess = guess_width(block, system)
             starts |= {} if guess is None else {"single echoes": guess}
             starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
         # Where a Gaussian misses the lone echoes by less than noise shows, there is nothing to learn but its width.
         plain = len(block) >= SMALL and figures.misfit_gaussians.get(1, np.inf) <= (figures.misfit_goal or 0.0)
-        if "lone echoes" in starts and not plain:
-            starts["lone echoes, jointly"] = learn_alone(block.rows(main.waveform), starts["lone echoes"])
+        if STACKED in starts and not plain:
+            starts[JOINTLY] = learn_alone(block.rows(main.waveform), starts[STACKED])
         choice = choose_pulse(thin_empty(block, system), starts, list_known(block, system), plain=plain)
         # Starts of guessed widths are measured from nothing, and know no defects.
         system, candidates = replace(choice.best.system, defects=first.defects), choice.tried

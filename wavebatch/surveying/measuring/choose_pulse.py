@@ -101,6 +101,7 @@ start: they had 3 to 5 % of false echoes in place of 1 to 2."""
 MISFITS = LEAST_MISFIT * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried, up to MOST_MISFIT."""
 
+STACKED, JOINTLY = "lone echoes", "lone echoes, jointly"
 OF_ALL, OF_ANY, AGAIN = "gaussian of all echoes", "all echoes", ", again"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, OF_ANY: {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
@@ -226,6 +227,9 @@ def choose_pulse(
     for one in {**starts, **given}.items():
         every.setdefault(one[1].pulse, one)
     looked = [_judge(few, name, system, CHANGES[1], known=name in given) for name, system in every.values()]
+    stacked, jointly = (next((one for one in looked if one.name == name), None) for name in (STACKED, JOINTLY))
+    if stacked and jointly and _save(jointly, stacked) <= LEAST_OF_KNOWN:  # the stack shows as much, with less freedom
+        looked.remove(jointly)
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
