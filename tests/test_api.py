@@ -323,6 +323,9 @@ def test_wrong_use_is_said_in_the_words_of_the_user(strips, tmp_path):
         next(strip.blocks())
     with pytest.raises(wb.ConfigError, match=r"--output .*out\.laz: this is a folder.* such as .*out$"):
         wb.run(strips[0], tmp_path / "out.laz")
+    for given, empty in (((strips[0], ""), "--output: the name"), (("", tmp_path), "the name of a file")):
+        with pytest.raises(wb.ConfigError, match=f"^{empty} is empty$"):
+            wb.run(*given)
     with pytest.raises(wb.StageError, match=r"got float64 .*round them"):
         wb.WaveformBlock.from_samples(np.zeros((2, 8)))
     with pytest.raises(wb.StageError, match="spacing must be above 0 ns, got 0"):

@@ -102,6 +102,8 @@ RUNS = [
     (f"{RUN} --report - --progress json", 2, "stdout"),
     (f"{RUN} --json --report -", 2, "would both write to stdout"),
     (f"{RUN} --json --progress json", 2, "would both write to stdout; leave one out"),
+    *((f"{RUN} --config s.toml", 2, f"s.toml: {name}: the name is empty; remove the line",
+       {"s.toml": f"[run]\n{name} = ''\n"}) for name in ("output", "system")),
     (f"{RUN} --config s.toml", 2, "'PDAL' is not one of .. 'opals' (s.toml); see `",
      {"s.toml": "[run]\nnames='PDAL'\n"}),
     *((words, 2, "the name is empty; is a variable of the shell not set?") for words in (
@@ -203,6 +205,7 @@ FILES = [
         ("reflectance;x;y;radius\n0,2;1;2;4\n", "it has reflectance;x;y;radius; a target .. CSV has commas between"),
         ("name,x\n", "no target in it"), ("reflectance,x,y\n0.2,1,2\n", "target 1: radius is missing"),
         ("x,y,radius\n1,2,3\n", "target 1: reflectance is missing"),
+        (_polygon(RING), "target 1: reflectance is missing, it has vertices; a target has reflectance\n"),
         ("reflectance,x,y,radius\nhalf,1,2,3\n", "target 1: not numbers"),
         ("reflectance,x,y,radius,incidence\n0.2,1,2,3,89\n", "incidence must lie in 0 to 85"),
         ("reflectance,vertices\n0.2,1 2 3\n", "target 1: not numbers"), ('{"features": 3}', "not GeoJSON"),

@@ -63,16 +63,18 @@ def test_the_scatter_of_points_is_measured(tmp_path, scatter):
     assert found.phase == pytest.approx(scatter, rel=0.15)  # these locations have no phase
 
 
-def test_rounded_coordinates_are_in_the_scatter(tmp_path, edit_points):
-    """Locations knew returns to 1 mm, whose coordinates are multiples of half a metre."""
+@pytest.mark.parametrize("values", [None, 21])
+def test_rounded_coordinates_are_in_the_scatter(tmp_path, edit_points, values):
+    """Locations knew returns to 1 mm, whose coordinates are multiples of half a metre; values: a raster of so few."""
 
     def round_places(points):
-        points["Z"] = 500 * np.round(points["Z"] / 500.0)
+        points["Y"] = 500 * (np.arange(len(points)) % values if values else np.round(points["Y"] / 500.0))
         return points
 
     write_strip(tmp_path / "a.las", TOWN, Flight(point_error=0.005), 3000, 3)
     found = measure(edit_points(tmp_path / "a.las", tmp_path / "b.las", round_places))
-    assert found.source == "rounding" and found.scatter == pytest.approx(0.5 / 12.0**0.5)
+    rounding = found.scatter == pytest.approx(0.5 / 12.0**0.5)
+    assert rounding == (found.source == "rounding") == (values is None), found
 
 
 @pytest.mark.parametrize(("wrong", "phase"), [(1.0, 1.5), (0.3, 0.005)], ids=["most", "some"])

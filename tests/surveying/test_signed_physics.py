@@ -216,7 +216,9 @@ def flickering(tmp_path_factory):
     flight = Flight(energy_spread=0.08, store_energy=True)
     truth = write_strip(folder / "strip.las", [Plane()], flight, 6000)
     lines = [f"{time:.9f},{energy:.9f}" for time, energy in zip(truth.gps_time, 7.5 * truth.energy, strict=True)]
-    (folder / "shots.csv").write_text("time,energy\n" + "\n".join(lines))
+    # Units may have spaces, and columns after those that count may be empty.
+    header = "time [GPS s],energy [nJ of a shot],temperature (deg C)\n"
+    (folder / "shots.csv").write_text(header + "\n".join(f"{line},{'20' * (i % 2)}" for i, line in enumerate(lines)))
     return folder, flight, truth
 
 
@@ -245,6 +247,8 @@ def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
         (lambda path: write(path, "time,power\n1,2\n"), "first line must name the columns time and energy"),
         (lambda path: write(path, "time,energy\n1,2\n2,x\n"), "a row has no number for time or energy"),
         (lambda path: write(path, "Time [s],Energy [uJ]\n1,2\n2,3\n"), "knows 0 of 6000 pulses of the strip"),
+        (lambda path: write(path, "time,pulse energy,temperature\n1,2,20\n"), "it is 'time pulse energy temperature'"),
+        (lambda path: write(path, "time,energy,temperature\n1,,20\n"), "a row has no number for time or energy"),
     ],
 )
 def test_energies_that_cannot_be_used_are_refused_in_one_line(tmp_path, flickering, make, message):

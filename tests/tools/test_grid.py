@@ -122,6 +122,21 @@ def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rng, tmp_path):
         assert found.read(1, window=window, masked=True).sum() >= part > 0
 
 
+def test_a_point_on_the_border_of_two_boxes_is_in_one_of_them(tmp_path):
+    write_points(tmp_path / "a.las", np.array([[x, y, 0.0] for x in (10.0, 20.0, 30.0) for y in (5.0, 6.0, 7.0)]))
+    counts = []
+    for number, box in enumerate(("10,5,20,7", "20,5,30,7", "10,7,20,8")):
+        path = tmp_path / f"{number}.tif"
+        _run(tmp_path / "a.las", "--statistic", "count", "--size", 1, "--bbox", box, "-o", path)
+        with rasterio.open(path) as found:
+            counts.append(found.read(1, masked=True).sum())
+    assert counts == [2, 2, 1]
+    for box in ("11,5,20,8", "10,2,30,5"):  # all points lie on its eastern, or northern, border
+        done = _run(tmp_path / "a.las", "--statistic", "count", "--size", 1, "--bbox", box, "-o",
+                    tmp_path / "x.tif", code=1)  # fmt: skip
+        assert "no point has a position within --bbox" in done.stderr
+
+
 def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(rng, tmp_path):
     _cloud(tmp_path / "a.las", rng, 500)
     _cloud(tmp_path / "b.las", rng, 500, west=600_000.0)

@@ -321,6 +321,8 @@ def test_polygons_first_come_and_what_is_outside(tmp_path):
     check_areas(one.areas, count_naively(*points, area_of), lambda area: area.name)
     assert [area.name for area in one.areas] == ["big", "corner", "outside"]
     check_sum(one.areas, one)
+    (one,), _ = count_returns([tmp_path / "c.las"], divisions=[PolygonSet(polygons[2:])])
+    assert "lies outside the strip" in one.warnings[0] and [area.name for area in one.areas] == ["outside"]
 
 
 @pytest.mark.parametrize("scale", [float("nan"), 1e300, float("inf")])

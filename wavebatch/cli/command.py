@@ -212,6 +212,8 @@ def _read_file(
 
 def _convert(value: Any, option: click.Option, path: Path) -> Any:
     """A value of TOML as the option takes it; paths are relative to the file."""
+    if value == "" and isinstance(option.type, click.Path):
+        raise click.UsageError(f"{path}: {_option_name(option)}: the name is empty; remove the line")
     if isinstance(option.type, click.Path) and isinstance(value, str) and value != "-":
         return str(path.parent / value)
     if isinstance(value, list):

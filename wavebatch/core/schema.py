@@ -170,6 +170,8 @@ def check_options(options: Any) -> None:
         if hasattr(value, "tolist"):  # of NumPy: reports are JSON
             value = value.tolist()
             object.__setattr__(options, name, value)
+        if value == "" and Path in one.kinds:  # pathlib takes it for the current folder
+            raise ConfigError(f"{place}: the name is empty")
         if one.choices is not None and value not in one.choices:
             raise ConfigError(f"{place} {value!r}: choose {', '.join(map(str, one.choices))}")
         forms = [_FORMS.get(typing.get_origin(kind) or kind, (kind, kind.__name__)) for kind in one.kinds]

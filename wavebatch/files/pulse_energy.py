@@ -6,6 +6,7 @@ the calibration, or of the strip where there is none: see `matching.strip_energi
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -167,9 +168,11 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
         if not Path(name).is_file():
             hint = name_columns(reader, name)
             raise InputError(f"{path}: --energy: no extra byte and no file is called {name!r}; {hint}")
-        lines = read_text(name, "file of pulse energies", 1 << 30).splitlines()
-        rows = [line.replace(",", " ").replace(";", " ").split() for line in lines if line.strip()]
-        header = [word.casefold() for word in rows[0] if word[0] not in "[("] if rows else []  # units, as in time [s]
+        lines = [line for line in read_text(name, "file of pulse energies", 1 << 30).splitlines() if line.strip()]
+        lines[:1] = [re.sub(r"[\[(][^\])]*[\])]", " ", line.casefold()) for line in lines[:1]]  # units, as in time [s]
+        # A name may have spaces, and a value may be missing: neither moves the columns after it.
+        rows = [re.split("[,;]", line) if "," in line or ";" in line else line.split() for line in lines]
+        header = [word.strip() for word in rows[0]] if rows else []
         if not {"time", "energy"} <= set(header):
             words = "its first line must name the columns time and energy"
             raise InputError(f"{name}: {words}; it is {' '.join(header)!r}")

@@ -120,6 +120,8 @@ def find_files(
     """
     files: dict[str, Path] = {}
     for argument in arguments:
+        if not argument:  # pathlib takes it for the current folder
+            raise ConfigError("the name of a file is empty")
         for path in _expand(argument, Path(), recursive, kinds):
             first = files.setdefault(real_name(path), path)
             if note is not None and os.path.abspath(first) != os.path.abspath(path):

@@ -253,8 +253,8 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
                 corners = radius * circle[: _CORNERS * (radius > 0)] + [float(fields["x"]), float(fields["y"])]
     except KeyError as error:
         needed = f"{error.args[0]} is missing, it has {', '.join(fields) or 'nothing'}"
-        raise ConfigError(f"{where}: {needed}; a target has reflectance, and x, y, radius or vertices; CSV has commas "
-                          "between them") from error  # fmt: skip
+        rest = "" if "vertices" in fields else ", and x, y, radius or vertices; CSV has commas between them"
+        raise ConfigError(f"{where}: {needed}; a target has reflectance{rest}") from error
     except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{where}: not numbers: {error}") from error
     if not LEAST_REFLECTANCE <= reflectance <= 1.5:

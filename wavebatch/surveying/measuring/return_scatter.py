@@ -41,6 +41,9 @@ ROUNDED, LEAST_ROUNDING = 2048, 1e-3
 """Points that show to what coordinates are rounded, since a common divisor of so many is no chance; and the least that
 counts [m]: millimetres are usual."""
 
+FEWEST_VALUES = 50
+"""Fewer different values of a coordinate may be true ones with a common step: two levels, or rows of a raster."""
+
 BETWEEN = (0.2, 0.8)
 """Where a return lies between its two neighbours, as a share of their distance: elsewhere a scan line ends."""
 
@@ -100,8 +103,9 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
 def _measure_rounding(reader: StripReader, scan: StripScan) -> float:
     """Standard deviation of what rounding takes off the coarsest coordinate: locations do not show it [m]."""
     points = reader.read_points(0, int(min(scan.borders[-1], ROUNDED)), scan)
-    steps = [np.gcd.reduce(np.diff(points[name].astype(np.int64))) for name in "XYZ"] if len(points) > LEAST else [0]
-    return float(np.max(np.multiply(steps, reader.facts.header.scales[: len(steps)]))) / 12.0**0.5
+    values = [np.unique(points[name]).astype(np.int64) for name in "XYZ"]
+    steps = [np.gcd.reduce(np.diff(one)) if len(one) >= FEWEST_VALUES else 0 for one in values]
+    return float(np.max(np.multiply(steps, reader.facts.header.scales))) / 12.0**0.5
 
 
 def _measure(residuals: np.ndarray) -> float | None:
