@@ -233,7 +233,7 @@ def choose_pulse(
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    tried = {one.name: one.system for one in hopeful} | ({OF_ALL: own} if plain else {})
+    tried = {one.name: one.system for one in hopeful if one.name != JOINTLY} | ({OF_ALL: own} if plain else {})
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
     found = _try_changes(held, found if plain else found + _learn(taught, held, begin))
     choice = _decide(found, small=small)
