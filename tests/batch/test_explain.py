@@ -178,7 +178,7 @@ def prepared(tiny_strip):
 
 @pytest.mark.parametrize(
     ("number", "share", "judged"),
-    [(LEAST_JUDGED - 1, 1.0, False), (LEAST_JUDGED, 0.21, True), (LEAST_JUDGED, MOST_FAILED, False)],
+    [(LEAST_JUDGED - 1, 1.0, False), (LEAST_JUDGED, 0.25, True), (LEAST_JUDGED, MOST_FAILED, False)],
 )
 def test_few_waveforms_and_usual_shares_of_failed_fits_are_not_judged(prepared, number, share, judged):
     seen = dict.fromkeys(("points_in", "waveforms", "points_out"), number)

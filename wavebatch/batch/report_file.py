@@ -260,8 +260,8 @@ LEAST_JUDGED = 20
 
 MOST_FAILED = 0.2
 """Share of echoes whose fit did not converge, or ended at a bound, that is far above usual: of a chain that suits a
-strip 6 % at most (17 to 22 % on four of 300 simulated ones); 21 % in fog, 24 % where a receiver recovers slowly from clipped echoes, 35 % on a RIEGL and 80 % on a
-Leica strip of Gaussians in place of the learned pulse."""
+strip 6 % at most (17 to 22 % on four of 300 simulated ones); 21 % in fog, 24 % where a receiver recovers slowly from
+clipped echoes, 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place of the learned pulse."""
 
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
