@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag
-from wavebatch.core.order import even_places, median, quantile
+from wavebatch.core.order import distinct, even_places, median, quantile
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -103,7 +103,7 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
 def _measure_rounding(reader: StripReader, scan: StripScan) -> float:
     """Standard deviation of what rounding takes off the coarsest coordinate: locations do not show it [m]."""
     points = reader.read_points(0, int(min(scan.borders[-1], ROUNDED)), scan)
-    values = [np.unique(points[name]).astype(np.int64) for name in "XYZ"]
+    values = [distinct(points[name].astype(np.int64)) for name in "XYZ"]
     steps = [np.gcd.reduce(np.diff(one)) if len(one) >= FEWEST_VALUES else 0 for one in values]
     return float(np.max(np.multiply(steps, reader.facts.header.scales))) / 12.0**0.5
 
