@@ -354,6 +354,14 @@ def test_rounds_of_all_echoes_end_where_none_is_surely_shorter(monkeypatch, leng
     assert [one.system.sigma_ref for one in found] == [1, taken]
 
 
+def test_a_joint_pulse_that_teaches_no_other_stands_for_itself():
+    """Twelve echoes are too few for a round."""
+    block = record(gaussian, 5, n=12)[0]
+    system = replace(survey_block(block, learn=False).system, components=((1.0, 0.0, 2.0), (0.02, 5.0, 2.0)))
+    choice = choose_pulse.choose_pulse(block, {choose_pulse.JOINTLY: system})
+    assert choice.best.name == choose_pulse.JOINTLY and choice.best.system.components == system.components
+
+
 @pytest.mark.parametrize("name", [choose_pulse.OF_ALL, *choose_pulse.ROUNDS])
 def test_what_was_learned_again_is_learned_from_all_waveforms_too(name):
     block = record(gaussian, 5, n=60)[0]

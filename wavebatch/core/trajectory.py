@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import median
 from wavebatch.core.units import ADJUSTED, WEEK
 
 LONGEST_GAP = 1.0
@@ -142,7 +143,7 @@ class Trajectory:
         near = (self.time[2:] >= start) & (self.time[:-2] <= stop) & (np.maximum(before, after) <= self.gap)
         if not near.any():
             return None
-        beyond = off - 0.5 * ACCELERATION * before * after - LEAST_JUMP - JUMP_SCATTER * float(np.median(off[near]))
+        beyond = off - 0.5 * ACCELERATION * before * after - LEAST_JUMP - JUMP_SCATTER * float(median(off[near]))
         worst = int(np.argmax(np.where(near, beyond, -np.inf)))
         return (float(self.time[worst + 1]), float(off[worst])) if beyond[worst] > 0 else None
 

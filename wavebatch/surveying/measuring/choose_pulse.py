@@ -233,9 +233,12 @@ def choose_pulse(
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    tried = {one.name: one.system for one in hopeful if one.name != JOINTLY} | ({OF_ALL: own} if plain else {})
+    learned = [] if plain else _learn(taught, held, begin)
+    # Where too few echoes teach further, what lone echoes teach jointly stands for itself.
+    tried = {one.name: one.system for one in hopeful if one.name != JOINTLY or not learned}
+    tried |= {OF_ALL: own} if plain else {}
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    found = _try_changes(held, found if plain else found + _learn(taught, held, begin))
+    found = _try_changes(held, found + learned)
     choice = _decide(found, small=small)
     if choice.best.name in starts and not _is_as_wide(choice.best, begin):
         # Few waveforms showed another start: what was learned from it may be of another pulse.
