@@ -1,6 +1,7 @@
 """Surveys and chains of sensors that the simulator does not have: other pulses, noise and baselines, rendered here."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,8 @@ from wavebatch.surveying import Survey, survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring import choose_pulse
 from wavebatch.surveying.measuring.choose_pulse import settle
+from wavebatch.surveying.measuring.joint_pulse import learn_jointly
+from wavebatch.surveying.measuring.judge import explain
 from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey, load_survey, parse_survey
 
 
@@ -327,31 +330,36 @@ def test_a_pulse_looks_too_good_to_the_waveforms_that_taught_it(errors, small, d
 
 
 @pytest.mark.parametrize(
-    ("lengths", "unsteady", "taken"),
+    ("n", "seed", "gaps", "echoes", "number", "taken"),
     [
-        ((60, 58, 56, 57), 0, 3), ((60, 58, 57.9, 50), 0, 3), ((60, 58, 57, 50), 3, 3), ((60, 58, 57, 50), 0, 4),
-        ((60, 58.1, 58.2, 50), 2, 2),
+        (160, 1, (1.2, 2.5), 3, 10, 9), (160, 1, (1.2, 2.5), 6, 5, 3), (160, 1, (2.0, 6.0), 6, 5, 4),
+        (160, 1, (1.5, 3.0), 6, 3, 2), (40, 10, (1.2, 2.5), 3, 4, 3),
     ],
 )  # fmt: skip
-def test_rounds_of_all_echoes_end_where_none_is_surely_shorter(monkeypatch, lengths, unsteady, taken):
-    """Of them the shortest is taken. One round gains a nat by one standard error: a further one is not looked at."""
-
-    def judge_round(block, name, system, change, known):
-        number = int(system.sigma_ref)
-        spread = (20 if number == unsteady else 0.1 * number) * np.resize([1.0, -1.0], 400)
-        length = lengths[min(number, len(lengths)) - 1] + spread
-        return choose_pulse.Candidate(name, system, change, length, 400, 400, known, 1, 0.0)
-
-    rounds = [("one", SystemPulse(1.0)), (choose_pulse.OF_ANY, SystemPulse(2.0))]
-    monkeypatch.setattr(choose_pulse, "_list_rounds", lambda *a: rounds)
-    monkeypatch.setattr(choose_pulse, "_judge", judge_round)
-    monkeypatch.setattr(choose_pulse, "explain", lambda *a, **k: None)
-    monkeypatch.setattr(
-        choose_pulse, "learn_jointly", lambda block, system, *a, **k: replace(system, sigma_ref=system.sigma_ref + 1)
-    )
-    begin = choose_pulse.Candidate("", SystemPulse(1.0), 0.0, np.ones(400), 400, 400, False, 1, 0.0)
-    found = choose_pulse._learn(None, None, begin)
-    assert [one.system.sigma_ref for one in found] == [1, taken]
+def test_rounds_of_all_echoes_go_on_while_each_surely_saves(n, seed, gaps, echoes, number, taken):
+    """At most eight further ones, by a quarter of a nat per echo and 1.5 errors; of them the shortest is taken."""
+    rng, x = np.random.default_rng(seed), np.arange(120)
+    samples, time = 12.0 + rng.standard_normal((n, 120)), rng.uniform(20, 30, (n, 1))
+    for _ in range(echoes):
+        samples += np.exp(rng.uniform(*np.log((20, 200)), (n, 1))) * skewed((x - time) / 2.5)
+        time += 2.5 * rng.uniform(*gaps, (n, 1))
+    block = WaveformBlock.from_samples(np.rint(np.maximum(samples, 0)).astype(np.uint16))
+    taught, held = block.rows(slice(0, None, 2)), block.rows(slice(1, None, 2))
+    judge_pulse = partial(choose_pulse._judge, held, change=choose_pulse.CHANGES[1], known=False)
+    begin = judge_pulse("gaussian", SystemPulse(3.5, noise=ReceiverNoise(baseline=12.0, std=1.04)))
+    rounds = [judge_pulse(*one) for one in choose_pulse._list_rounds(taught, begin)][1:]
+    is_worth = True
+    while is_worth and len(rounds) < 10:
+        before, last = rounds[-2:]
+        saved = len(held) * (before.typical - last.typical) / before.echoes
+        is_worth = saved > 0.25 and before.exceeds(last) > 1.5
+        if is_worth:
+            explained = explain(taught, choose_pulse.bear(last.system, begin.change))
+            rounds.append(judge_pulse("", learn_jointly(taught, last.system, explained, begin.change, last=True)))
+    lengths = [one.typical for one in rounds]
+    assert len(rounds) == number and int(np.argmin(lengths[1:])) + 1 == taken
+    found = choose_pulse._learn(taught, held, begin)
+    assert [one.typical for one in found[1:]] == [lengths[0], lengths[taken]]
 
 
 def test_a_joint_pulse_that_teaches_no_other_stands_for_itself():

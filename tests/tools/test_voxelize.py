@@ -29,6 +29,7 @@ from wavebatch.tools.simulate.render import FlightLine, Recording, find_pulse
 from wavebatch.tools.simulate.scenes import simulate_block
 from wavebatch.tools.simulate.strip import WKT, StripOptions
 from wavebatch.tools.voxels import rays
+from wavebatch.tools.voxels.grid import VoxelGrid
 from wavebatch.tools.voxels.rays import Ceiling, Deconvolution, Floor, _pulse_taps, deconvolve_block
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
@@ -889,6 +890,27 @@ def test_times_of_many_packets_are_no_pulse(canopy, tmp_path):
         strip = write_recorded(tmp_path / f"{time}.las", *pulses, record(canopy[0], 4), time=np.full(N, time))
         summary, _ = voxelize_pulses(strip, tmp_path)
         assert summary.pulses == summary.waveforms > N and summary.several_packets == summary.lost_packets == 0
+
+
+def test_errors_of_shares_are_those_of_voxels_with_as_many_rays():
+    """Two rays per voxel that leaves catch one by one, or forty that one clump catches together: no surer than one."""
+    rng, each = np.random.default_rng(1), np.repeat([2, 40], 800)
+    column = np.repeat(np.arange(1600), each)
+    caught = np.where(each[column] == 2, rng.random(len(column)), rng.random(1600)[column]) < 0.5
+    table, samples = np.zeros(len(column), rays.RAY), np.zeros(len(column), rays.SAMPLE)
+    table["start"] = np.column_stack([*divmod(column, 40), np.full(len(column), 9.0)]) + [0.5, 0.5, 0.0]
+    table["step"], table["end"], table["known"], table["count"] = (0.0, 0.0, -1.0), 9.0, np.inf, 1
+    table["first"] = samples["packet"] = np.arange(len(column))
+    samples["time"], samples["spacing"] = np.where(caught, 3.5, 8.5), 0.1
+    samples["energy"] = samples["canopy"] = 1.0
+    with VoxelGrid(1.0, np.zeros(3, np.int64), 2.0**-20, sections=False, everything=True) as grid:
+        grid.add(rays.Rays(table, samples), rays.LightRule())
+        grid.measure_spread()
+        (index, found), = grid.pieces()
+    high = index[:, 2] == 5
+    few, many = (found["share_error"][high & (found["rays"] == number)] for number in (2, 40))
+    assert len(few) == len(many) == 800 and few.mean() == pytest.approx(0.33, abs=0.04)
+    assert many.mean() == pytest.approx(0.67, abs=0.04)
 
 
 @pytest.mark.slow

@@ -353,8 +353,7 @@ def _leave_out_unknown(
         new = decompose.decompose_clusters(some, known, windows, again)
         each = factor[new.cluster]
         fitted = new._replace(
-            misfit=new.misfit * each, cost=new.cost * factor**2, errors=new.errors / each[:, None],
-            shared=new.shared / each[:, None] ** 2,
+            misfit=new.misfit * each, errors=new.errors / each[:, None], shared=new.shared / each[:, None] ** 2
         )  # fmt: skip
         solution = decompose.Solution(*map(np.concatenate, zip(solution, fitted, strict=True))).take(order)
         table = describe(clusters, solution)
