@@ -60,6 +60,18 @@ def test_signalling_nans_in_points_are_no_numbers_and_no_warnings(tmp_path, poin
         invoke(command, strip, tmp_path / "out")
 
 
+def test_infinite_times_are_no_warning_of_numpy(tmp_path):
+    strip = tmp_path / "a.las"
+    simulate_strip("urban", strip, pulses=300, seed=1)
+    with strip.open("r+b") as file:
+        header = file.read(235)
+        start, size = (int.from_bytes(header[at:end], "little") for at, end in ((96, 100), (105, 107)))
+        for point in range(100, 200):
+            file.seek(start + point * size + 20)
+            file.write(np.float64(np.inf).tobytes())
+    succeed("run", strip, "-o", tmp_path / "out", "--columns", "+range", "-q")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX systems")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_what_is_no_file_is_refused_at_once(tmp_path, command):

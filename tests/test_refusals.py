@@ -143,6 +143,9 @@ RUNS = [
     (f"{RUN} --classes 2,300", 2, "--classes: .. must be numbers from 0 to 255"),
     (f"{RUN} --bbox 1,2,3", 2, "is not WEST,SOUTH,EAST,NORTH"),
     (f"{RUN} --bbox 5,2,3,9", 2, "--bbox: 5,2,3,9 must be .. west < east"),
+    *((f"{command} --bbox 500000,500900,5400200,5400300", 2,
+       "the order must be west, south, east, north; .. give 500000,5400200,500900,5400300")
+      for command in (RUN, "plot map strip.las --column z -o p.png", "grid strip.las --column z --size 5 -o x.tif")),
     (f"{RUN} --polygon none.geojson", 2, "none.geojson"),
     (f"{RUN} --chain fast.toml --where 'incidence_angle_normals < 5'", 2, "does not compute it; add stage",
      {"fast.toml": effective(load_profile("fast"))}),
@@ -467,7 +470,7 @@ def _refuse(folder, command, code, words):
     for start, package in (("plot", "matplotlib"), ("grid", "rasterio")):
         if command.startswith(start):
             pytest.importorskip(package)
-    is_begun = code == 4 or "--where" in command  # a run that reads a strip has made its folder
+    is_begun = code == 4 or "--where" in command or "order" in words  # a run that reads a strip has made its folder
     before = _list_files(folder, folders=not is_begun)
     done = run_command(*shlex.split(command), prog_name="wavebatch")
     assert done.exit_code == code and done.stdout == "", done.output

@@ -141,10 +141,6 @@ def test_options_of_several_commands_mean_the_same():
     read_or_written = {"--chain", "--truth", "--angles"}
     numbers = {"--point-format", "--no-data", "--pulses", "--width", "--most"}
     assert mixed.keys() <= read_or_written | numbers
-    assert set(program.OLD_NAMES.values()) <= seen.keys()
-    for title, command in _commands():
-        names = {name for option in command.params for name in option.opts}
-        assert not any({old, new} <= names for old, new in program.OLD_NAMES.items()), title
 
 
 def test_every_command_has_quiet_and_debug():
@@ -158,13 +154,6 @@ def test_quiet_hides_what_is_written_but_no_warning(tiny_strip, tmp_path):
                    for name, words in (("a", ()), ("b", ("-q",))))  # fmt: skip
     assert loud.exit_code == still.exit_code == 0 and loud.stdout == still.stdout
     assert "a.toml: written" in loud.stderr and still.stderr == ""
-
-
-def test_old_names_of_options_work_with_a_remark(tiny_strip, tmp_path):
-    (tmp_path / "a.las").write_bytes(tiny_strip.read_bytes())
-    old = invoke("stats", tmp_path / "a.las", "--where", "flag(WEAK) or z > 0", "--polygons=none.json")
-    assert old.exit_code == 2 and old.stderr.startswith("remark: --polygons is now --polygon; ")
-    assert "none.json" in old.stderr.splitlines()[1]
 
 
 def test_version_names_python_and_the_libraries():
@@ -210,6 +199,12 @@ def test_the_order_is_command_line_variable_file(folder):
     assert "--profile balanced (WAVEBATCH_RUN_PROFILE)" in shown.stderr
     shown = _dry(folder, "--tolerance", "5m", "--points", "returns", WAVEBATCH_PROFILE="fast")
     assert shown.exit_code == 0 and shown.stderr == ""  # what excludes others takes their place
+
+
+def test_a_wrong_condition_names_where_it_comes_from(folder):
+    (folder / "wavebatch.toml").write_text('[run]\nwhere = "z = 2"\n')
+    assert f"write == for '=' ({folder / 'wavebatch.toml'})" in _dry(folder).stderr
+    assert "(WAVEBATCH_WHERE)" in _dry(folder, WAVEBATCH_WHERE="z = 2").stderr
 
 
 @pytest.mark.parametrize(("weak", "strong"), [('profile = "fast"', "tolerance"), ('chain = "c.toml"', "profile")])

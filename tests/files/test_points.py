@@ -26,6 +26,7 @@ from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype, read
 from wavebatch.files.las.read_points import open_points, read_checked_header
 from wavebatch.files.las.write_points import CHUNK_POINTS, PointFile, Statistics, compress_rows
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.tools.simulate import simulate_strip
 
 
 def read(path, *ranges):
@@ -536,3 +537,15 @@ def test_flags_of_the_account_that_are_no_unsigned_integers_are_no_flags(tmp_pat
     with CloudReader(path) as cloud:
         (rows,) = cloud.read_pieces()
     assert set(cloud.written) == {"amplitude"} and (rows["amplitude"] == 2).all() and not rows["flags"].any()
+
+
+def test_a_laz_that_claims_too_few_points_is_named(tmp_path):
+    """Its last chunk does not say how many it holds: 41 of 60 points were left out without a word."""
+    strip = tmp_path / "a.laz"
+    simulate_strip("flat", strip, pulses=60, seed=1)
+    assert not read_checked_header(strip).warnings
+    data = bytearray(strip.read_bytes())
+    data[107:111] = (19).to_bytes(4, "little")
+    strip.write_bytes(data)
+    (line,) = read_checked_header(strip).warnings
+    assert line.startswith("the header claims 19 points, but 60 by return number")

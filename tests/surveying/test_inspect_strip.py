@@ -123,7 +123,7 @@ def test_check_notes_do_no_harm_unless_strict(tmp_path):
     path = raw.write(tmp_path / "a.las")
     result = succeed("check", path)
     assert "note: descriptor 1 has gain 0" in result.stdout
-    assert "note: counts by return in the header are wrong (first returns: 0, counted: 40)" in result.stdout
+    assert "note: counts by return in the header are wrong (return 1: 0, counted: 40)" in result.stdout
     assert run("check", path, "--strict").exit_code == 1
 
 

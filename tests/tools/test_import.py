@@ -290,7 +290,7 @@ def test_waves_of_another_file_are_named(tmp_path, rng):
         waves.write(bytes(9))
     size = path.with_suffix(".wvs").stat().st_size
     (note,) = [one for one in import_file(path, tmp_path / "b.las", ImportOptions()).notes if "another file" in one]
-    assert note.startswith(f"its pulses use {size - 9} of the {size} bytes of {path.stem}.wvs")
+    assert note.startswith(f"warning: its pulses use {size - 9} of the {size} bytes of {path.stem}.wvs")
 
 
 def test_a_cut_file_leaves_nothing_behind(tmp_path, rng):

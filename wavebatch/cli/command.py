@@ -62,10 +62,6 @@ MOST_BYTES = 1 << 20
 SIMILAR = 0.74
 """Least similarity of a variable that no command reads to one that is read, for a warning: JBOS to JOBS is 0.75."""
 
-OLD_NAMES = {"--bounds": "--bbox", "--polygons": "--polygon", "--flags-with": "--flags",
-             "--flags-without": "--drop-flags", "--pulse-energy": "--energy", "--tolerance": "--within"}  # fmt: skip
-"""Names of earlier versions, and what they are now."""
-
 _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")
 """Names of the arguments that are files to read; settings lie beside the first."""
 
@@ -141,7 +137,7 @@ def _list_options(command: click.Command) -> dict[str, click.Option]:
     return {one.name: one for one in command.params if isinstance(one, click.Option)}
 
 
-def _find_source(ctx: click.Context, option: click.Option | None) -> tuple[str, Any]:
+def find_source(ctx: click.Context, option: click.Option | None) -> tuple[str, Any]:
     """Settings file or variable that gives an option, and what it gives; empty and None for all other options."""
     name = "" if option is None else option.name or ""
     source = ctx.get_parameter_source(name)
@@ -195,7 +191,6 @@ def _read_file(
     known = {_option_name(one): name for name, one in options.items() if name != "config"}
     found = {}
     for key, value in table.items():
-        key = OLD_NAMES.get(f"--{key}", key).removeprefix("--") if key not in known else key
         if key not in known:
             raise click.UsageError(f"{path}: [{title}] has no option {shorten(key)}; {nearest(key, list(known))}")
         # A profile may also be the path of a chain file.
@@ -335,7 +330,6 @@ class ProgramCommand(click.Command):
 
         Numbers must be finite, because no limit of an option holds for NaN.
         """
-        args = [self._rename(word) for word in args]
         is_real = not ctx.resilient_parsing and {"-h", "--help"}.isdisjoint(args)
         if is_real:
             read_settings(self, self.title, ctx, args)
@@ -344,7 +338,7 @@ class ProgramCommand(click.Command):
             with click.core.augment_usage_errors(ctx):  # click names no command where a value is missing
                 rest = super().parse_args(ctx, args)
         except click.BadParameter as error:
-            if error.param is not None and (place := _find_source(ctx, options.get(error.param.name or ""))[0]):
+            if error.param is not None and (place := find_source(ctx, options.get(error.param.name or ""))[0]):
                 error.message = f"{error.message.removesuffix('.')} ({place})"
             raise
         for option in self.params:
@@ -366,7 +360,7 @@ class ProgramCommand(click.Command):
                     ctx.set_parameter_source(name, ParameterSource.DEFAULT)
             lines, shown = [], []
             for name, option in options.items():
-                place, value = _find_source(ctx, option)
+                place, value = find_source(ctx, option)
                 if not place:
                     continue
                 is_file = ctx.get_parameter_source(name) is ParameterSource.DEFAULT_MAP
@@ -378,16 +372,6 @@ class ProgramCommand(click.Command):
             if shown:
                 talk(f"settings: {', '.join(shown)}")
         return rest
-
-    def _rename(self, word: str) -> str:
-        """A word of the command line with the new name of an option, and a remark."""
-        old, mark, value = word.partition("=")
-        new = OLD_NAMES.get(old, "")
-        names = {name for option in self.params for name in option.opts}
-        if new not in names or old in names:
-            return word
-        talk(f"remark: {old} is now {new}; the old name goes with the next version")
-        return new + mark + value
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the options by group, then the examples."""

@@ -21,7 +21,14 @@ import click
 from click.core import ParameterSource
 
 from wavebatch.batch.options import OPTIONS, RunOptions, check_together
-from wavebatch.cli.command import READ, complete_files, complete_flags, complete_profiles, complete_written
+from wavebatch.cli.command import (
+    READ,
+    complete_files,
+    complete_flags,
+    complete_profiles,
+    complete_written,
+    find_source,
+)
 from wavebatch.cli.messages import LEVELS, LOG, answer, begin_log, keep_level, one_line, report_errors, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
@@ -175,7 +182,8 @@ class Text(click.ParamType):
             return self._read(value)
         except ConfigError as error:
             place = "" if param is None or str(error).startswith("--") else f"{param.opts[-1]}: "
-            raise click.UsageError(f"{place}{error}", ctx) from error
+            source = "" if ctx is None else find_source(ctx, param)[0]
+            raise click.UsageError(f"{place}{error}" + (f" ({source})" if source else ""), ctx) from error
 
 
 def declared(name: str, text: str = "", kind: type = RunOptions, **more: Any) -> Callable:

@@ -19,7 +19,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_files, complete_scenes
-from wavebatch.cli.messages import answer, counting, print_summary, tell
+from wavebatch.cli.messages import answer, counting, print_summary, talk, tell
 from wavebatch.core.schema import declared_options
 from wavebatch.core.units import count
 from wavebatch.tools import simulate as simulation
@@ -80,7 +80,7 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
             width = f" {sent['fwhm_ns']:.3f} ns wide at half maximum," if math.isfinite(sent["fwhm_ns"]) else ":"
             tell(f"{place}: outgoing pulses{width} energies vary by {spread:.2f} %, known to {error:.2f} %")
         for note in summary.notes:
-            tell(f"{place}: {note}")
+            (talk if note.startswith("warning:") else tell)(f"{place}: {note}")
         return summary
 
     # A single file that fails is one line too, with the exit code of a batch.

@@ -195,7 +195,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     for number in chosen:
         points = reader.read_unit(int(number), scan).points
         # Points of one pulse follow each other: each pulse counts once.
-        new = np.append(True, np.diff(points["gps_time"]) != 0)[: len(points)]
+        new = np.append(True, points["gps_time"][1:] != points["gps_time"][:-1])[: len(points)]
         values = np.append(values, found.read(points[new]))
     there = values[np.isfinite(values)]
     if request is None and len(there) < min(LEAST_KNOWN, len(values)):

@@ -139,8 +139,9 @@ def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:
         yield f"{count(timeless, 'point')} without a possible GPS time: neither their pulses nor ranges can be known"
     known = 15 if claimed.version >= (1, 4) else 5
     if claimed.by_return[:known] != true.by_return[:known]:
-        first, really = claimed.by_return[0], true.by_return[0]
-        yield f"counts by return in the header are wrong (first returns: {first}, counted: {really})"
+        pairs = zip(claimed.by_return, true.by_return, strict=False)
+        number, (wrong, right) = next((k, pair) for k, pair in enumerate(pairs, 1) if pair[0] != pair[1])
+        yield f"counts by return in the header are wrong (return {number}: {wrong}, counted: {right})"
     slack = 1.5 * np.abs(claimed.scales)
     outside = (np.array(true.mins) < np.array(claimed.mins) - slack) | (np.array(true.maxs) > claimed.maxs + slack)
     if not np.all(~outside):

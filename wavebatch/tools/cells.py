@@ -23,7 +23,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
 from wavebatch.files.cloud.column_names import read_provenance
-from wavebatch.files.cloud.point_filter import EVERY, PointFilter
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter, check_bbox
 from wavebatch.files.disk.raw_bytes import undoing
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
@@ -266,14 +266,16 @@ class Grid:
         return np.where(inside, row, -1).astype(np.int64), np.where(inside, column, -1).astype(np.int64), inside
 
 
-def check_cells(statistic: str, bounds: Box | None) -> None:
-    """Raises ConfigError for an unknown statistic, and for bounds that hold no place."""
+def check_cells(statistic: str, bounds: Box | None, paths: Sequence[Path]) -> None:
+    """Raises ConfigError for an unknown statistic, and for bounds of clouds that hold no place, or in another order."""
     if statistic not in STATISTICS:
         raise ConfigError(f"statistic {statistic!r} is not one of {', '.join(STATISTICS)}")
     if bounds is not None:
         west, south, east, north = bounds
         if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):
             raise ConfigError("--bbox must be WEST,SOUTH,EAST,NORTH, west of east and south of north")
+        for path in paths:
+            check_bbox(bounds, path, read_header(path))
 
 
 def compute_cells(statistic: str, cell: np.ndarray, values: np.ndarray, number: int, area: float) -> np.ndarray:
@@ -486,7 +488,7 @@ def grid_values(
     """
     if size is not None and not (LEAST_SIZE <= size <= LARGEST_SIZE):
         raise ConfigError(f"cells must be at least {LEAST_SIZE:g} and at most {LARGEST_SIZE:g} m long, got {size:g}")
-    check_cells(statistic, bounds)
+    check_cells(statistic, bounds, paths)
     check_statistic(column, statistic)
     clouds = Clouds(paths, (column,), chosen)
     check_statistic(column, statistic, clouds.facts, paths[0])

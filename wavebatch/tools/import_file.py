@@ -189,7 +189,7 @@ def import_file(
     notes = []
     if end < header.waves_size:  # nothing in a .wvs names its .pls
         used = f"{end} of the {header.waves_size} bytes of {header.waves.name}"
-        notes.append(f"its pulses use {used}, which may be that of another file: then its points are wrong")
+        notes.append(f"warning: its pulses use {used}, which may be that of another file: then its points are wrong")
     if plan.one_time:
         notes.append("all pulses have the same time; they get times 0.1 ms apart")
     if plan.unknown:

@@ -99,7 +99,9 @@ class PointFilter:
         )
 
     def place(self, path: Path, header: LasHeader) -> PointFilter:
-        """Return the filter with its polygons in the coordinates of a strip; raises as `Polygon.place`."""
+        """Return the filter with polygons in the coordinates of a strip; raises as `Polygon.place`, `check_bbox`."""
+        if self.bbox is not None:
+            check_bbox(self.bbox, path, header)
         return replace(self, polygons=tuple(one.place(path, header) for one in self.polygons))
 
     def plan(self, standard: Mapping[str, ReadColumn], find: Callable[[str], ReadColumn], name: str) -> PlannedFilter:
@@ -154,6 +156,25 @@ class PointFilter:
 
 EVERY = PointFilter()
 """All points."""
+
+
+def check_bbox(bbox: Sequence[float], path: Path, header: LasHeader) -> None:
+    """Raise ConfigError for a box in the order west, east, south, north, where x and y of a strip tell it from ours.
+
+    Such a box is large and holds any part of the strip. It is known by numbers beyond x and y of the strip, the second
+    nearer to x, the third nearer to y.
+    """
+    west, south, east, north = bbox
+    (left, low, _), (right, high, _) = header.mins, header.maxs
+    is_apart = right < low or high < left
+    is_whole = west <= left and right <= east and south <= low and high <= north
+    would_meet = west <= right and south >= left and east <= high and north >= low
+    x, y = 0.5 * (left + right), 0.5 * (low + high)
+    if is_apart and not is_whole and would_meet and abs(south - x) < abs(south - y) and abs(east - y) < abs(east - x):
+        raise ConfigError(
+            f"{path}: --bbox: the order must be west, south, east, north; the strip has x {left:.10g} to {right:.10g}, "
+            f"y {low:.10g} to {high:.10g}; give {west:.15g},{east:.15g},{south:.15g},{north:.15g}"
+        )
 
 
 @frozen(eq=False)

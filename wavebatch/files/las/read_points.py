@@ -113,6 +113,9 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
             # A program that was stopped writes its points, but not their number.
             warnings = (f"the header claims {header.point_count} points, which leaves room for {more} more before "
                         f"{limit}; what is there is not read: if points are missing, get the strip again",)  # fmt: skip
+    elif (returns := sum(header.by_return)) > header.point_count:  # the size of the last chunk does not say how many
+        warnings = (f"the header claims {header.point_count} points, but {returns} by return number; no more are "
+                    "read: if points are missing, get the strip again",)  # fmt: skip
     legacy, count = header.counts
     if header.version >= (1, 4) and legacy and legacy != count:
         used = "64-bit" if count else "legacy"

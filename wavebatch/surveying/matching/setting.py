@@ -466,8 +466,9 @@ def _measure_rate(reader: StripReader) -> float | None:
     """Pulses per second by the shortest usual distance of GPS times: pulses without a point leave longer ones."""
     count, rates = reader.facts.header.point_count, []
     for start in np.unique(np.linspace(0, max(count - SLICE_POINTS, 0), SLICES).astype(np.int64)).tolist():
-        step = np.diff(widen_integers(reader.read_points(start, min(start + SLICE_POINTS, count))["gps_time"]))
-        later = step[np.isfinite(step) & (step > 0)]
+        time = widen_integers(reader.read_points(start, min(start + SLICE_POINTS, count))["gps_time"])
+        step = np.diff(time[np.isfinite(time)])
+        later = step[step > 0]
         if not len(later) or np.mean(step >= 0) < LEAST_IN_ORDER:
             continue
         shortest = np.quantile(later, 0.1)
