@@ -137,7 +137,7 @@ def _list_options(command: click.Command) -> dict[str, click.Option]:
     return {one.name: one for one in command.params if isinstance(one, click.Option)}
 
 
-def find_source(ctx: click.Context, option: click.Option | None) -> tuple[str, Any]:
+def find_setting(ctx: click.Context, option: click.Option | None) -> tuple[str, Any]:
     """Settings file or variable that gives an option, and what it gives; empty and None for all other options."""
     name = "" if option is None else option.name or ""
     source = ctx.get_parameter_source(name)
@@ -338,7 +338,7 @@ class ProgramCommand(click.Command):
             with click.core.augment_usage_errors(ctx):  # click names no command where a value is missing
                 rest = super().parse_args(ctx, args)
         except click.BadParameter as error:
-            if error.param is not None and (place := find_source(ctx, options.get(error.param.name or ""))[0]):
+            if error.param is not None and (place := find_setting(ctx, options.get(error.param.name or ""))[0]):
                 error.message = f"{error.message.removesuffix('.')} ({place})"
             raise
         for option in self.params:
@@ -360,7 +360,7 @@ class ProgramCommand(click.Command):
                     ctx.set_parameter_source(name, ParameterSource.DEFAULT)
             lines, shown = [], []
             for name, option in options.items():
-                place, value = find_source(ctx, option)
+                place, value = find_setting(ctx, option)
                 if not place:
                     continue
                 is_file = ctx.get_parameter_source(name) is ParameterSource.DEFAULT_MAP

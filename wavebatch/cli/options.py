@@ -27,7 +27,7 @@ from wavebatch.cli.command import (
     complete_flags,
     complete_profiles,
     complete_written,
-    find_source,
+    find_setting,
 )
 from wavebatch.cli.messages import LEVELS, LOG, answer, begin_log, keep_level, one_line, report_errors, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
@@ -182,7 +182,7 @@ class Text(click.ParamType):
             return self._read(value)
         except ConfigError as error:
             place = "" if param is None or str(error).startswith("--") else f"{param.opts[-1]}: "
-            source = "" if ctx is None else find_source(ctx, param)[0]
+            source = "" if ctx is None else find_setting(ctx, param)[0]
             raise click.UsageError(f"{place}{error}" + (f" ({source})" if source else ""), ctx) from error
 
 
