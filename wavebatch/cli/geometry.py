@@ -149,6 +149,10 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
             counts["cube"] = list(cube.write(meta, reader.facts.crs, overwrite=overwrite))
         if writer:
             writer.commit()
+    for line in reader.facts.warnings:
+        talk(f"{strip}: warning: {line}")
+    if scan.broken:
+        talk(f"{strip}: warning: packets of {count(scan.broken, 'point')} cannot be used; `wavebatch check` says why")
     if not counts["lines"]:
         none = "no scan line" if scan.with_waveform else "no waveform, so no scan line"
         talk(f"{strip}: has {none}" + ("" if options["lines"] == _ALL else " with a number in --lines"))
@@ -252,7 +256,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
 
             summary = voxelize_strip(strip, targets[strip], settings, progress=show, **more)
         for line in summary.warnings:  # with --quiet too: they say how far the values can be trusted
-            talk(f"warning: {line}")
+            talk(f"{strip}: warning: {line}")
         for line in _list_lines(summary):
             tell(line)
         return summary

@@ -124,7 +124,10 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
         numbers = f"{count(summary.points, 'point')} and {count(summary.waveforms, 'waveform')}"
         tell(f"{summary.output}: {numbers}")
         for line in summary.repaired:
-            tell(f"{summary.output}: repaired: {line}")
+            if line.startswith("warning:"):
+                talk(f"{summary.output}: {line}")
+            else:
+                tell(f"{summary.output}: repaired: {line}")
         return summary
 
     summaries, failed = shared.for_each(paths, work, debug=options["debug"])

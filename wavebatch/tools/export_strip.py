@@ -13,6 +13,7 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.units import count
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.raw_bytes import take_fingerprint
@@ -86,12 +87,12 @@ def export_strip(
         elif scan.vectors.direction == "away":
             repaired.append("packet vectors pointed away from the sensor; they point toward it")
         if scan.broken:
-            repaired.append(f"{scan.broken} points had packets that cannot be used; they have none")
+            repaired.append(f"{count(scan.broken, 'point')} had packets that cannot be used; they have none")
         if scan.short:
             repaired.append(
-                f"{scan.short} points had packets shorter than their descriptor; they have descriptors of their length"
+                f"{count(scan.short, 'point')} had packets shorter than their descriptor; now descriptors fit"
             )
-        repaired += [*scan.notes, *facts.warnings, *audit_header(reader, scan)]
+        repaired += [*scan.notes, *audit_header(reader, scan), *(f"warning: {line}" for line in facts.warnings)]
         source = {"file": facts.path.name, **take_fingerprint(facts.path, facts.packets.file)}
         account = json.dumps({"export": source, "repaired": repaired, "version": __version__}, sort_keys=True)
         waveforms = write(reader, scan, target, account, overwrite, progress)

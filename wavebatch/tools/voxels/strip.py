@@ -21,7 +21,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, CheckedOptions, Range, option
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, count
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
@@ -298,6 +298,10 @@ def voxelize_strip(
             summary.outside, summary.energy, summary.unknown = grid.outside, grid.energy, grid.unknown
             if calibration is None:
                 summary.warnings += (*name_gains(reader.facts, scan),)
+            summary.warnings += reader.facts.warnings
+            if scan.broken:
+                lost = f"packets of {count(scan.broken, 'point')} cannot be used; `wavebatch check` says why"
+                summary.warnings += (lost,)
             # Where returns share packets, and no pulse has several, those that are left hold all light.
             split = summary.several_packets > 0 or scan.with_waveform == scan.packets
             summary.warnings += (*_doubt_returns(shown.reshape(16, 16), summary.pulses, split),)
