@@ -40,7 +40,7 @@ from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_pr
 from wavebatch.files.strip.reader import StripReader, measure_scale
 from wavebatch.stages.attribute.basic import position
 from wavebatch.tools.scan_slices import Segment
-from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.render import FlightLine
 from wavebatch.tools.simulate.strip import WKT
 from wavebatch.tools.slice_output import SegmentWriter
@@ -237,7 +237,8 @@ def in_feet(source, target):
 @pytest.mark.quick_cases("flat")
 @pytest.mark.parametrize("scene", ["urban", "flat"])
 def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
-    simulate_strip(scene, tmp_path / "m.las", pulses=30_000, seed=3, flight=FlightLine(pulse_rate=50_000))
+    slow = replace(find_scene(scene), flight=FlightLine(pulse_rate=50_000))
+    simulate_strip(slow, tmp_path / "m.las", pulses=30_000, seed=3)
     feet = in_feet(tmp_path / "m.las", tmp_path / "feet.las")
     chain = tmp_path / "chain.toml"
     stages = ("noise.pooled", "detect.maximum", "decompose.closed_form", "attribute.position", "attribute.range")

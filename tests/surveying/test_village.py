@@ -28,7 +28,7 @@ def test_the_error_of_a_beam_that_the_widths_contradict_is_that_of_the_farther_e
 
 def test_the_radius_of_neighbourhoods_holds_enough_points(tmp_path):
     sparse = replace(SCENE.flight, pulse_rate=0.1 * SCENE.flight.pulse_rate)
-    simulate_strip("village", tmp_path / "v.las", pulses=900, seed=3, flight=sparse)
+    simulate_strip(replace(SCENE, flight=sparse), tmp_path / "v.las", pulses=900, seed=3)
     xyz = laspy.read(tmp_path / "v.las").xyz
     apart = np.sort(np.linalg.norm(xyz[:, None] - xyz, axis=2), axis=1)[:, LEAST_NEIGHBOURS * 3 // 2 - 1]
     assert choose_radius(xyz) == pytest.approx(np.ceil(10 * np.quantile(apart, 0.9)) / 10)

@@ -18,7 +18,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.scan_slices import ScanLine, Segment, read_scan_lines
-from wavebatch.tools.slice_output import CubeBuilder, SegmentWriter, align_pulses, cut_cube
+from wavebatch.tools.slice_output import SegmentWriter, align_pulses, cut_cube, write_cube
 from wavebatch.tools.voxels.grid import COLUMNS
 
 LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)
@@ -101,10 +101,7 @@ def test_profiles_count_sum_and_average(cloud, voxels):
 
 
 def build_cube(path, lines):
-    cube = CubeBuilder(path)
-    for line in lines:
-        cube.add(line)
-    cube.write({}, None, overwrite=False)
+    write_cube(path, lines, {}, None, overwrite=False)
     return np.load(path)
 
 

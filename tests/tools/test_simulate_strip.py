@@ -61,8 +61,9 @@ def read_strip(path):
 
 
 def read_truth(path):
-    with TruthReader(path) as reader:
-        return reader.meta, reader.read(*ECHO_COLUMNS), reader.read("packet_byte_offset", "packet_gps_time")
+    with TruthReader(path) as reader, np.load(path) as whole:
+        packets = {name: whole[name] for name in ("packet_byte_offset", "packet_gps_time")}
+        return reader.meta, {name: whole[name] for name in ECHO_COLUMNS}, packets
 
 
 @pytest.mark.parametrize(("point_format", "version", "internal"), FORMATS)

@@ -19,7 +19,7 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.tools import scan_slices as segments
 from wavebatch.tools import slice_output as output
 from wavebatch.tools.scan_slices import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
-from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.render import EAST, GROUND, NORTH, FlightLine
 
 FLIGHT = FlightLine(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
@@ -30,7 +30,7 @@ PULSES = 4000
 def strip(tmp_path_factory):
     """Four scan lines of 1000 pulses over facets of 0 to 40 degrees, 40 m wide."""
     path = tmp_path_factory.mktemp("slices") / "slope.las"
-    simulate_strip("slope", path, pulses=PULSES, seed=6, flight=FLIGHT)
+    simulate_strip(replace(find_scene("slope"), flight=FLIGHT), path, pulses=PULSES, seed=6)
     return path
 
 

@@ -24,7 +24,7 @@ from wavebatch.surveying import Survey, survey_block
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.systems.survey_result import SavedSurvey
-from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.render import FlightLine, Recording, find_pulse
 from wavebatch.tools.simulate.scenes import simulate_block
 from wavebatch.tools.simulate.strip import WKT, StripOptions
@@ -104,8 +104,8 @@ def sum_by_layer(found):
 def forest(tmp_path_factory):
     """1500 pulses over a forest, and the truth."""
     folder = tmp_path_factory.mktemp("voxels")
-    flight = FlightLine(half_angle=3.0, pulse_rate=50_000.0)
-    simulate_strip("forest", folder / "forest.las", pulses=1500, seed=8, truth=folder / "truth.npz", flight=flight)
+    scene = replace(find_scene("forest"), flight=FlightLine(half_angle=3.0, pulse_rate=50_000.0))
+    simulate_strip(scene, folder / "forest.las", pulses=1500, seed=8, truth=folder / "truth.npz")
     return folder / "forest.las", folder / "truth.npz"
 
 
@@ -292,8 +292,8 @@ def test_every_ray_that_crossed_a_voxel_with_signal_counts(tmp_path):
 
 def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_path):
     strip = tmp_path / "hills.las"
-    flight = FlightLine(half_angle=3.0, pulse_rate=30_000.0)
-    simulate_strip("urban", strip, pulses=1500, seed=4, flight=flight)
+    scene = replace(find_scene("urban"), flight=FlightLine(half_angle=3.0, pulse_rate=30_000.0))
+    simulate_strip(scene, strip, pulses=1500, seed=4)
     near, far = (
         voxelize(strip, tmp_path / "v.npz", 0.8, headroom=headroom, overwrite=True)[1] for headroom in (None, 300.0)
     )

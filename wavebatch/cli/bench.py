@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.command import complete_scenes
+from wavebatch.cli.command import complete
 from wavebatch.cli.messages import answer, talk
 from wavebatch.tools.bench import command
 from wavebatch.tools.sheets.sheet import list_lines
@@ -20,7 +20,7 @@ from wavebatch.tools.sheets.sheet import list_lines
 
 @click.command()
 @click.argument("files", nargs=-1, type=shared.INPUT, metavar="[STRIP...] [CHAIN...]")
-@click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
+@click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete("scenes"),
               help="Simulate this scene, e.g. mixed, open or forest; `wavebatch simulate --help` lists all; may be "
               "repeated.")
 @shared.options_of(command.BenchOptions)

@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.command import complete_columns
+from wavebatch.cli.command import complete
 from wavebatch.cli.messages import answer, talk, tell
 from wavebatch.cli.plot import choose_points, find_clouds
 from wavebatch.core.errors import InputError
@@ -166,7 +166,7 @@ FEW_CELLS = 1_000_000
 @click.command()
 @shared.clouds_argument
 @shared.declared("recursive")
-@click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
+@click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete("columns"),
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
 @shared.options_of(GridOptions)
 @click.option("--forest", is_flag=True, help="Metrics of voxels that voxelize --forest made, in place of columns: "

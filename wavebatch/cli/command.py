@@ -19,7 +19,7 @@ import math
 import os
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -257,60 +257,40 @@ def complete_files(context: click.Context, parameter: click.Parameter, incomplet
     return found
 
 
-def complete_profiles(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Complete the shipped chains and auto."""
-    from wavebatch.stages.chain import list_profiles
-
-    return [name for name in ("auto", *list_profiles()) if name.startswith(incomplete)]
+_FIELDS = ("x", "y", "z", "intensity", "return_number", "number_of_returns", "classification", "scan_angle",
+           "user_data", "point_source_id", "gps_time")  # fmt: skip
+"""Standard fields that clouds usually have."""
 
 
-def complete_flags(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Complete the last of several flags with commas."""
-    from wavebatch.core.echoes import EchoFlag
+def complete(kind: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """What shells offer for names of a kind: chains, flags, written (columns of `run`), columns, stages or scenes.
 
-    return _complete_last(incomplete, (flag.name or "" for flag in EchoFlag), upper=True)
+    Of flags and written columns the last one is completed; those before its comma are not offered again.
+    """
 
+    def offer(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+        from wavebatch.core.echoes import COLUMNS, EchoFlag
+        from wavebatch.stages.chain import STAGES, list_profiles, load_plugins
+        from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES
 
-def complete_written(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Complete the last of several columns that `run` can write, with commas, each with or without `+`."""
-    from wavebatch.core.echoes import COLUMNS
+        before, comma, last = incomplete.rpartition(",") if kind in ("flags", "written") else ("", "", incomplete)
+        last = last.upper() if kind == "flags" else last
+        given = {part.upper().lstrip("+") for part in before.split(",")}
+        ours = [name for name, column in COLUMNS.items() if column.extra_bytes]
+        if kind == "stages":
+            load_plugins()
+        names = {
+            "chains": ("auto", *list_profiles()),
+            "flags": [flag.name or "" for flag in EchoFlag],
+            "written": [f"+{name}" for name in ours] if last.startswith("+") else ours,
+            "columns": list(dict.fromkeys([*ours, *_FIELDS])),
+            "stages": sorted(STAGES),
+            "scenes": (*SCENES, *OTHER_NAMES),
+        }[kind]
+        fitting = (name for name in names if name.startswith(last) and name.upper().lstrip("+") not in given)
+        return [f"{before}{comma}{name}" for name in fitting]
 
-    names = [name for name, column in COLUMNS.items() if column.extra_bytes]
-    last = incomplete.rpartition(",")[2]
-    return _complete_last(incomplete, (f"+{name}" for name in names) if last.startswith("+") else names)
-
-
-def complete_columns(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Complete columns that clouds of wavebatch usually have."""
-    from wavebatch.core.echoes import COLUMNS
-
-    standard = ("x", "y", "z", "intensity", "return_number", "number_of_returns", "classification", "scan_angle",
-                "user_data", "point_source_id", "gps_time")  # fmt: skip
-    names = [*(name for name, column in COLUMNS.items() if column.extra_bytes), *standard]
-    return [name for name in dict.fromkeys(names) if name.startswith(incomplete)]
-
-
-def complete_stages(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Complete the names of stages, those of other packages too."""
-    from wavebatch.stages.chain import STAGES, load_plugins
-
-    load_plugins()
-    return sorted(name for name in STAGES if name.startswith(incomplete))
-
-
-def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Complete the scenes of `simulate` and `bench`."""
-    from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES
-
-    return [name for name in (*SCENES, *OTHER_NAMES) if name.startswith(incomplete)]
-
-
-def _complete_last(incomplete: str, names: Iterable[str], *, upper: bool = False) -> list[str]:
-    """Complete the part after the last comma; names that stand before it are not offered again."""
-    before, comma, last = incomplete.rpartition(",")
-    last = last.upper() if upper else last
-    given = {(part.upper() if upper else part).lstrip("+") for part in before.split(",")}
-    return [f"{before}{comma}{name}" for name in names if name.startswith(last) and name.lstrip("+") not in given]
+    return offer
 
 
 MAYBE_NAN = ("no_data",)

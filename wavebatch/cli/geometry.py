@@ -25,8 +25,8 @@ from wavebatch.files.geojson import GEOJSON_CRS, plan_crs
 from wavebatch.files.las.crs import describe_crs, read_crs_definition
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
+from wavebatch.tools import slice_output
 from wavebatch.tools.scan_slices import SliceOptions, cut_slice, find_segments, read_scan_lines
-from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, CubeBuilder, SegmentWriter, draw_segments, draw_slice
 from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions, VoxelSummary, voxelize_strip
 
@@ -97,7 +97,7 @@ def slice_(strips: tuple[str, ...], output: Path | None, **options: Any) -> None
     paths = shared.find_inputs(strips, recursive=options["recursive"])
     if extras and len(paths) > 1:
         raise ConfigError(f"{extras[0]}: one file for {len(paths)} strips; make them one by one")
-    targets = {} if output is None else shared.name_outputs(paths, output, SEGMENT_SUFFIXES, ".csv")
+    targets = {} if output is None else shared.name_outputs(paths, output, slice_output.SEGMENT_SUFFIXES, ".csv")
     shared.finish_each(paths, lambda strip: _slice(strip, targets.get(strip), options), options)
 
 
@@ -117,20 +117,23 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
         settings = shared.from_options(SliceOptions, options, **{"sigma": sigma} if sigma else {}, floor=floor)
         counts: dict[str, Any] = {"lines": 0, "pulses": 0, "segments": 0, "full": 0, "sigma": settings.sigma}
         writer, every = None, []
-        cube = CubeBuilder(options["cube"]) if options["cube"] else None
+        cube, kept, samples = options["cube"], [], 0
         if output:
-            writer = stack.enter_context(SegmentWriter(output, crs=crs, overwrite=overwrite))
+            writer = stack.enter_context(slice_output.SegmentWriter(output, crs=crs, overwrite=overwrite))
         for line in takewhile(lambda one: end is None or one.number < end, read_scan_lines(reader, scan)):
             if line.number < first:
                 continue
             piece = cut_slice(line, settings)
             segments = find_segments(piece, settings)
             if png and not counts["lines"]:
-                draw_slice(piece, segments, png, strip=strip.name, overwrite=overwrite)
+                slice_output.draw_slice(piece, segments, png, strip=strip.name, overwrite=overwrite)
             if overview:
                 every += segments
             if cube:
-                cube.add(line)
+                kept.append(line)
+                samples += len(line.row)
+                if samples > (most := slice_output.MOST_VALUES):
+                    raise ConfigError(f"--cube {cube}: more than {most} samples; choose fewer --lines")
             if writer:
                 writer.write(segments)
             counts["lines"] += 1
@@ -142,11 +145,11 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
         if overview:
             if not every:
                 raise InputError(f"{overview}: not drawn, because the scan lines have no segment")
-            draw_segments(every, overview, strip=strip.name, lines=counts["lines"], crs=describe_crs(strip)[0],
-                          overwrite=overwrite)  # fmt: skip
+            look = {"strip": strip.name, "lines": counts["lines"], "crs": describe_crs(strip)[0]}
+            slice_output.draw_segments(every, overview, **look, overwrite=overwrite)
         if cube:
             meta = {"version": __version__, "strip": strip.name}
-            counts["cube"] = list(cube.write(meta, reader.facts.crs, overwrite=overwrite))
+            counts["cube"] = list(slice_output.write_cube(cube, kept, meta, reader.facts.crs, overwrite=overwrite))
         if writer:
             writer.commit()
     for line in reader.facts.warnings:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.command import complete_files, complete_stages
+from wavebatch.cli.command import complete, complete_files
 from wavebatch.cli.messages import answer, print_sheet, print_text, printable, talk
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.units import count
@@ -211,7 +211,7 @@ def _list_parts(facts: dict[str, Any]) -> Iterator[Part]:
 
 
 @click.command()
-@click.argument("name", required=False, shell_complete=complete_stages)
+@click.argument("name", required=False, shell_complete=complete("stages"))
 @shared.common_options("json")
 def stages(name: str | None, **options: Any) -> None:
     """List the algorithms that a chain can use, those of one kind, or explain the one called NAME.

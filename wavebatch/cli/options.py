@@ -21,14 +21,7 @@ import click
 from click.core import ParameterSource
 
 from wavebatch.batch.options import OPTIONS, RunOptions, check_together
-from wavebatch.cli.command import (
-    READ,
-    complete_files,
-    complete_flags,
-    complete_profiles,
-    complete_written,
-    find_setting,
-)
+from wavebatch.cli.command import READ, complete, complete_files, find_setting
 from wavebatch.cli.messages import LEVELS, LOG, answer, begin_log, keep_level, one_line, report_errors, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
@@ -163,7 +156,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
 """Values of options of RunOptions from their texts."""
 
 
-_COMPLETE = {"profile": complete_profiles, "drop_flags": complete_flags, "columns": complete_written}
+_COMPLETE = {"profile": complete("chains"), "drop_flags": complete("flags"), "columns": complete("written")}
 """What shells offer after these options."""
 
 
@@ -237,7 +230,7 @@ def where_option(text: str) -> Callable:
 
 
 selection_options = together(
-    click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+    click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete("flags"),
                  help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
     declared("drop_flags", "Leave out points with one of these flags.", multiple=True, default=()),
     where_option("Use only points"),

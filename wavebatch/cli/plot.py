@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.command import complete_columns, complete_flags
+from wavebatch.cli.command import complete
 from wavebatch.cli.messages import NearestGroup, answer, talk, tell
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count
@@ -86,9 +86,9 @@ def read_range(text: str) -> tuple[float, ...]:
 
 
 @draws_clouds(
-    click.option("--column", required=True, shell_complete=complete_columns,
+    click.option("--column", required=True, shell_complete=complete("columns"),
                  help="Extra dimension or standard field; echo_flags counts flags."),
-    click.option("--by", metavar="COLUMN", shell_complete=complete_columns,
+    click.option("--by", metavar="COLUMN", shell_complete=complete("columns"),
                  help="Draw one line per value of this column, e.g. number_of_returns or classification."),
     click.option("--bins", type=click.IntRange(1, 10_000), metavar="N",
                  help="Number of bins.  [default: by the spread]"),
@@ -142,7 +142,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
 
 
 @draws_clouds(
-    click.option("--column", shell_complete=complete_columns,
+    click.option("--column", shell_complete=complete("columns"),
                  help="Extra dimension or standard field; not needed for count and density."),
     click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]),
                  default="mean", show_default=True,
@@ -203,7 +203,7 @@ _ENDS = "X0,Y0,X1,Y1"
                  help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]"),
     click.option("--width", type=float, metavar="W",
                  help="Show what lies within half of W from the line.  [default: a fiftieth of its length]"),
-    click.option("--column", shell_complete=complete_columns,
+    click.option("--column", shell_complete=complete("columns"),
                  help="Column for the colours.  [default: z; energy for voxels]"),
     click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
                  help="Exaggerate heights F times."),
@@ -235,7 +235,8 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
 
 
 @draws_clouds(
-    click.option("--column", shell_complete=complete_columns, help="Column for --statistic sum and mean, e.g. energy."),
+    click.option("--column", shell_complete=complete("columns"),
+                 help="Column for --statistic sum and mean, e.g. energy."),
     click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
                  help="Of the points or voxels of a height.  [default: sum with --column, else count]"),
     click.option("--size", type=float, metavar="M", help="Height of a bin.  [default: about a sixtieth of all]"),
@@ -323,7 +324,7 @@ def plot() -> None:
               help="Draw the packet of this point, counted from 0; may be repeated.")
 @click.option("--gps-time", "times", multiple=True, type=float, metavar="T",
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
-@click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+@click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete("flags"),
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
 @shared.where_option("Draw the first waveforms with echoes")
 @click.option("--most", type=click.IntRange(1, 100), metavar="N",

@@ -18,7 +18,7 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.command import complete_files, complete_scenes
+from wavebatch.cli.command import complete, complete_files
 from wavebatch.cli.messages import answer, counting, print_summary, talk, tell
 from wavebatch.core.schema import declared_options
 from wavebatch.core.units import count
@@ -148,7 +148,7 @@ _output = shared.output_option("Strip to write: .las or .laz.")
 
 
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
-@click.argument("scene", shell_complete=complete_scenes)
+@click.argument("scene", shell_complete=complete("scenes"))
 @_output
 @shared.output_option("Write the true echoes.", "FILE.npz", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")

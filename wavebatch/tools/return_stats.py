@@ -526,11 +526,8 @@ class _Tally:
     def merge(self, other: _Tally) -> None:
         """Adds the sums of another cloud."""
         self.methods |= other.methods
-        self.left_out += other.left_out
-        self.incomplete += other.incomplete
-        self.crowded += other.crowded
-        self.depth += other.depth
-        self.distances += other.distances
+        for name in ("left_out", "incomplete", "crowded", "depth", "distances"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
         for area, more in zip((self.whole, *self.areas), (other.whole, *other.areas), strict=True):
             area._join(more._areas, more._sums)
         if other.flags is not None:

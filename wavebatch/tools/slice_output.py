@@ -36,67 +36,51 @@ _LARGEST = 1e30
 """Largest time [ns] and sample [DN]; damaged files have larger ones."""
 
 
-class CubeBuilder:
-    """Collects scan lines, one after the other, and writes them as a cube."""
+def write_cube(
+    target: Path, lines: Sequence[ScanLine], meta: dict[str, Any], crs: str | None, *, overwrite: bool
+) -> tuple[int, int, int]:
+    """Writes scan lines as a cube; returns its shape: lines, pulses, times.
 
-    def __init__(self, target: Path) -> None:
-        if target.suffix.lower() != ".npz":
-            raise ConfigError(f"--cube {target}: a cube is written as .npz")
-        self._target = target
-        self._lines: list[ScanLine] = []
-        self._samples = 0
-
-    def add(self, line: ScanLine) -> None:
-        """Adds a line; ConfigError where the cube grows too large."""
-        self._lines.append(line)
-        self._samples += len(line.row)
-        if self._samples > MOST_VALUES:
-            raise ConfigError(f"--cube {self._target}: more than {MOST_VALUES} samples; choose fewer --lines")
-
-    def write(self, meta: dict[str, Any], crs: str | None, *, overwrite: bool) -> tuple[int, int, int]:
-        """Writes the cube; returns its shape: lines, pulses, times.
-
-        values f4 (lines, pulses, times): samples above the level without signal [DN], NaN where nothing was recorded.
-        time f8 (times,): two-way [ns], from the plane across the mean ray through the sample nearest to the sensor.
-        offset f4 (lines, pulses): to add to the times of a pulse [ns], within half a sample: samples are moved, not
-        interpolated. line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no pulse at
-        that scan angle. Raises InputError without a line, and where lines differ in their spacing.
-        """
-        lines, name = self._lines, str(self._target)
-        if not lines:
-            raise InputError(f"{name}: not written, because there is no scan line")
-        spacing = lines[0].spacing
-        if any(abs(line.spacing - spacing) > 1e-6 * spacing for line in lines):
-            raise InputError(f"{name}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
-        # Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known.
-        origin, direction = (np.concatenate([getattr(line, key) for line in lines]) for key in ("origin", "direction"))
-        starts = np.split(align_times(origin, direction), np.cumsum([len(line) for line in lines])[:-1])
-        shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
-        columns = align_pulses(lines)
-        pulses = 1 + max(int(column.max()) for column in columns)
-        times = 1 + max(int((shift[i][line.row] + np.rint(line.time / spacing)).max()) for i, line in enumerate(lines))
-        if len(lines) * pulses * times > MOST_VALUES:
-            raise ConfigError(
-                f"{name}: {len(lines)} lines of up to {pulses} pulses over {times} samples are too many: choose fewer"
-            )
-        shape = (len(lines), pulses)
-        values = np.full((*shape, times), np.nan, np.float32)
-        place = {"gps_time": np.full(shape, np.nan), "offset": np.full(shape, np.nan, np.float32)}
-        place |= {name: np.full((*shape, 3), np.nan) for name in ("origin", "direction")}
-        for i, line in enumerate(lines):
-            sample = shift[i][line.row] + np.rint(line.time / spacing).astype(np.int64)
-            values[i, columns[i][line.row], sample] = line.value
-            for key in ("gps_time", "origin", "direction"):
-                place[key][i, columns[i]] = getattr(line, key)
-            place["offset"][i, columns[i]] = starts[i] - shift[i] * spacing
-        number = np.array([line.number for line in lines])
-        arrays: dict[str, Any] = {"values": values, "time": np.arange(times) * spacing, "line": number, **place}
-        arrays |= {"crs": np.array(crs or ""), "meta": np.array(json.dumps(meta, sort_keys=True))}
-        with Draft(self._target, overwrite=overwrite) as draft:
-            with reporting(self._target):
-                np.savez_compressed(draft.file, **arrays)
-            draft.publish()
-        return arrays["values"].shape
+    values f4 (lines, pulses, times): samples above the level without signal [DN], NaN where nothing was recorded.
+    time f8 (times,): two-way [ns], from the plane across the mean ray through the sample nearest to the sensor.
+    offset f4 (lines, pulses): to add to the times of a pulse [ns], within half a sample: samples are moved, not
+    interpolated. line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no pulse at
+    that scan angle. Raises InputError without a line, and where lines differ in their spacing.
+    """
+    if not lines:
+        raise InputError(f"{target}: not written, because there is no scan line")
+    spacing = lines[0].spacing
+    if any(abs(line.spacing - spacing) > 1e-6 * spacing for line in lines):
+        raise InputError(f"{target}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
+    # Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known.
+    origin, direction = (np.concatenate([getattr(line, key) for line in lines]) for key in ("origin", "direction"))
+    starts = np.split(align_times(origin, direction), np.cumsum([len(line) for line in lines])[:-1])
+    shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
+    columns = align_pulses(lines)
+    pulses = 1 + max(int(column.max()) for column in columns)
+    times = 1 + max(int((shift[i][line.row] + np.rint(line.time / spacing)).max()) for i, line in enumerate(lines))
+    if len(lines) * pulses * times > MOST_VALUES:
+        raise ConfigError(
+            f"{target}: {len(lines)} lines of up to {pulses} pulses over {times} samples are too many: choose fewer"
+        )
+    shape = (len(lines), pulses)
+    values = np.full((*shape, times), np.nan, np.float32)
+    place = {"gps_time": np.full(shape, np.nan), "offset": np.full(shape, np.nan, np.float32)}
+    place |= {name: np.full((*shape, 3), np.nan) for name in ("origin", "direction")}
+    for i, line in enumerate(lines):
+        sample = shift[i][line.row] + np.rint(line.time / spacing).astype(np.int64)
+        values[i, columns[i][line.row], sample] = line.value
+        for key in ("gps_time", "origin", "direction"):
+            place[key][i, columns[i]] = getattr(line, key)
+        place["offset"][i, columns[i]] = starts[i] - shift[i] * spacing
+    number = np.array([line.number for line in lines])
+    arrays: dict[str, Any] = {"values": values, "time": np.arange(times) * spacing, "line": number, **place}
+    arrays |= {"crs": np.array(crs or ""), "meta": np.array(json.dumps(meta, sort_keys=True))}
+    with Draft(target, overwrite=overwrite) as draft:
+        with reporting(target):
+            np.savez_compressed(draft.file, **arrays)
+        draft.publish()
+    return arrays["values"].shape
 
 
 def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:

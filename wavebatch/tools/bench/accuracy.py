@@ -51,10 +51,6 @@ class Figure:
         """Value and error; None where there were no data."""
         return without_nan(asdict(self))
 
-    def scale(self, factor: float) -> Figure:
-        """The figure in another unit."""
-        return Figure(self.value * factor, self.error * factor)
-
 
 def share_figure(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
     """Sum of `part` over that of `whole`, counts per waveform (n,) in groups (n,), as a figure.
@@ -370,7 +366,8 @@ class AccuracyTally:
         }
         every = np.ones(len(e["time"]), bool)
         for kind, rows in (("all", every), ("isolated", e["isolated"]), ("overlapped", ~e["isolated"])):
-            figures[f"rmse_{kind}_cm"] = _spread(e, "time", rows).scale(CM_PER_NS)
+            found_ns = _spread(e, "time", rows)
+            figures[f"rmse_{kind}_cm"] = Figure(found_ns.value * CM_PER_NS, found_ns.error * CM_PER_NS)
             if kind == "all":
                 continue
             clear = rows & e["clear"]

@@ -464,7 +464,7 @@ def synthesize_strip(
     options: SynthesisOptions | None = None,
     *,
     overwrite: bool = False,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = lambda points: None,
     piece: int = PIECE,
 ) -> SynthesisSummary:
     """Writes the points of `cloud` with modelled waveforms to `target` (.las or .laz); returns the counts.
@@ -536,8 +536,7 @@ def synthesize_strip(
                 most = recordings[0].clip - recordings[0].baseline
                 summary.saturated += int(np.count_nonzero(amplitude > most))
                 summary.scattered += int(np.count_nonzero(rows["total"][starts] != count))
-                if progress:
-                    progress(len(rows))
+                progress(len(rows))
             light.check_widths()
             writer.commit()
     return summary

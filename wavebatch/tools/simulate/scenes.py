@@ -589,19 +589,17 @@ def seed_block(scene: Scene) -> int:
     return min(SEED_BLOCK, SEED_SAMPLES // scene.recording.n_samples)
 
 
-def simulate_seed_block(scene: Scene, seed: int, number: int, flight: FlightLine | None = None) -> Simulated:
+def simulate_seed_block(scene: Scene, seed: int, number: int) -> Simulated:
     """Pulses [k number, k (number + 1)) of the scene with this seed, k from `seed_block`."""
     n = seed_block(scene)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
-    return simulate_pulses(scene, n, rng, first=number * n, flight=flight)
+    return simulate_pulses(scene, n, rng, first=number * n)
 
 
-def simulate_pulses(
-    scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0, flight: FlightLine | None = None
-) -> Simulated:
+def simulate_pulses(scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0) -> Simulated:
     """Block, truth and rays of pulses [first, first + n)."""
     recording = scene.recording
-    rays = trace_rays(flight or scene.flight or FlightLine(), scene.terrain, first + np.arange(n))
+    rays = trace_rays(scene.flight or FlightLine(), scene.terrain, first + np.arange(n))
     drawn = scene.draw(rng, n, rays)
     signal = paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
     counts = record_counts(recording, signal, rng, drawn.constant)

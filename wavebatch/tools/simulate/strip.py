@@ -32,7 +32,7 @@ from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, build_dtype, fi
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.stages.score import find_isolated_echoes
-from wavebatch.tools.simulate.render import EAST, NORTH, FlightLine
+from wavebatch.tools.simulate.render import EAST, NORTH
 from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, fill_packets, list_returns
 from wavebatch.tools.simulate.scenes import Scene, Simulated, find_scene, seed_block, simulate_seed_block
 
@@ -117,13 +117,6 @@ class TruthReader(Closing):
                 rows = min(size, length - start)
                 yield {name: self._read_column(name, member, rows) for name, member in members.items()}
 
-    def read(self, *names: str) -> dict[str, np.ndarray]:
-        """The named columns whole."""
-        pieces = list(self.read_pieces(*names))
-        if not pieces:
-            return {name: np.empty(0, _DTYPES[name]) for name in names}
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
-
     def _read_column(self, name: str, member: IO[bytes], rows: int) -> np.ndarray:
         dtype = np.dtype(_DTYPES[name])
         data = member.read(rows * dtype.itemsize)
@@ -204,9 +197,8 @@ def simulate_strip(
     seed: int = 0,
     options: StripOptions | None = None,
     truth: Path | None = None,
-    flight: FlightLine | None = None,
     overwrite: bool = False,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = lambda pulses: None,
 ) -> StripSummary:
     """Writes a strip of the scene to `target` (.las or .laz), and the truth to the .npz `truth`; returns the counts.
 
@@ -217,7 +209,7 @@ def simulate_strip(
     Raises ConfigError for wrong values, InputError when a file exists or cannot be written; no file remains then.
     """
     scene, options = find_scene(scene), options or StripOptions()
-    parts = _simulate_parts(scene, pulses, seed, flight, progress)
+    parts = _simulate_parts(scene, pulses, seed, progress)
     summary, whole = StripSummary(), seed_block(scene)
     with (
         NpzWriter(truth, _DTYPES, overwrite=overwrite) if truth else nullcontext() as truth_writer,
@@ -295,9 +287,8 @@ def simulate_returns(
     seed: int = 0,
     receiver: DiscreteReceiver | None = None,
     options: StripOptions | None = None,
-    flight: FlightLine | None = None,
     overwrite: bool = False,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = lambda pulses: None,
 ) -> ReturnSummary:
     """Writes the returns that a discrete receiver has of the scene to `target` (.las or .laz); returns the counts.
 
@@ -311,7 +302,7 @@ def simulate_returns(
             f"point formats 4 and 5 number {options.most_returns} returns, the receiver has {receiver.most}; "
             "take 9 or 10"
         )
-    parts = _simulate_parts(scene, pulses, seed, flight, progress)
+    parts = _simulate_parts(scene, pulses, seed, progress)
     summary = ReturnSummary()
     point_format = WITHOUT_WAVES[options.point_format]
     version, wkt = ((1, 4), WKT) if point_format >= 6 else ((1, 2), None)
@@ -329,7 +320,7 @@ def simulate_returns(
 
 
 def _simulate_parts(
-    scene: Scene, pulses: int, seed: int, flight: FlightLine | None, progress: Callable[[int], object] | None
+    scene: Scene, pulses: int, seed: int, progress: Callable[[int], object]
 ) -> Iterator[Simulated]:
     """Pulses 0 to `pulses` of the scene, a seed block at a time; progress is called when the caller has used one."""
     if pulses < 1:
@@ -337,9 +328,8 @@ def _simulate_parts(
     block = seed_block(scene)
     for first in range(0, pulses, block):
         n = min(block, pulses - first)
-        yield simulate_seed_block(scene, seed, first // block, flight).cut(0, n)
-        if progress:
-            progress(n)
+        yield simulate_seed_block(scene, seed, first // block).cut(0, n)
+        progress(n)
 
 
 def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale: float) -> np.ndarray:

@@ -174,7 +174,7 @@ def voxelize_strip(
     headerless: bool = False,
     overwrite: bool = False,
     profiles: Path | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
     block_size: int | None = None,
     held: int = HELD,
     unit_points: int | None = None,
@@ -275,8 +275,7 @@ def voxelize_strip(
                 if writer is not None:
                     writer.add_rays(traced)
                 summary.add(traced.table)
-                if progress is not None:
-                    progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
+                progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
             grid.measure_spread()
             summary.left_out = 0 if keep is None else scan.packets - summary.waveforms
             meta = _describe(strip, options, grid, pulse, calibration) | {
