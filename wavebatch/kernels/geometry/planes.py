@@ -52,8 +52,6 @@ _TIGHT_ROUNDS = 3
 """Rounds in which sets that are not smooth use only the nearer points."""
 _ROUNDS = 8
 """Largest number of rounds."""
-_MOVED, _NEW = 2, 3
-"""States of a set, as in kernels/c/planes.h; 0: it is done."""
 
 
 class Planes(NamedTuple):
@@ -110,19 +108,10 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
         raise ValueError("points lie in no set, or not in the order of their sets")
     start = np.zeros(n + 1, np.int64)
     np.cumsum(np.bincount(group, minlength=n), out=start[1:])
-    axes, spreads, centre = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
-    whole, kept, limit = np.zeros((n, 10)), np.ones(len(group), bool), np.full(n, np.inf)
-    covariance, state = np.empty((n, 3, 3)), np.full(n, _NEW, np.uint8)
-    found = axes, spreads, whole, kept, limit, centre, covariance, state
-    for number in range(1 + _ROUNDS):
-        tight = TIGHT if number <= _TIGHT_ROUNDS else 0.0
-        factors = map(ctypes.c_double, (SMOOTH, tight, OUTLYING * MAD_TO_STD, LEAST_SPREAD))
-        call("trim_planes", ctypes.c_int64(n), start, xyz, *factors, *found)
-        moved = np.flatnonzero(state == _MOVED)
-        spreads[moved], axes[moved] = np.linalg.eigh(covariance[moved])
-        if not state.any():
-            break
-    return Planes(axes, spreads, centre, np.bincount(group, kept, minlength=n).astype(np.int64), limit)
+    planes = Planes(np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.int64), np.empty(n))
+    factors = map(ctypes.c_double, (SMOOTH, TIGHT, OUTLYING * MAD_TO_STD, LEAST_SPREAD))
+    call("trim_planes", ctypes.c_int64(n), start, xyz, *factors, *map(ctypes.c_int64, (_TIGHT_ROUNDS, _ROUNDS)), *planes)
+    return planes
 
 
 def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
