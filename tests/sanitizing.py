@@ -34,6 +34,7 @@ from wavebatch.kernels.fit.decompose import (
 )
 from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
+from wavebatch.kernels.geometry.planes import Planes, compare_halves
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_correlated, find_maxima, quiet_levels
 from wavebatch.kernels.signal.noise import coloured_variance, fit_factors, measure_covariance
@@ -237,6 +238,8 @@ def add_up(rng: np.random.Generator) -> None:
     settings = ctypes.c_int64(n), start, xyz, *factors, *map(ctypes.c_int64, (3, 4))
     library.call("trim_planes", *settings, np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), kept, limit)
     assert (kept <= sizes).all()
+    planes = Planes(rng.normal(0, 1, (n, 3, 3)), np.ones((n, 3)), rng.normal(0, 1, (n, 3)), kept, limit)
+    compare_halves(xyz, np.repeat(np.arange(n), sizes), planes)
     r, s, lags = (int(rng.choice([0, 1, 2, 3, 9, 30])) for _ in range(3))
     weights, correlation = rng.choice([*ODD, np.nan], (r, s)), rng.normal(0, 1, lags)
     assert coloured_variance(weights, correlation).shape == (r,)

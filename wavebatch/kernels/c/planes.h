@@ -120,6 +120,54 @@ EXPORT int64_t trim_planes(int64_t n, const int64_t *start, const double *points
     return good ? 0 : -1;
 }
 
+enum { CUTS = 6, HALF_SUMS = 10 };             /* number, and sums of u, v, r, uu, uv, vv, ur, vr and rr of places in a plane */
+
+/* What a plane r = a + b u + c v explains of the squares of r; -INFINITY where there is none. */
+static double explain_heights(const double *s, int64_t least, double singular, double *slopes) {
+    const double uu = s[4] - s[1] * s[1] / s[0], uv = s[5] - s[1] * s[2] / s[0], vv = s[6] - s[2] * s[2] / s[0];
+    const double ur = s[7] - s[1] * s[3] / s[0], vr = s[8] - s[2] * s[3] / s[0], size = uu * vv - uv * uv;
+    slopes[0] = (ur * vv - vr * uv) / size;
+    slopes[1] = (vr * uu - ur * uv) / size;
+    if (!(s[0] >= least && size > singular * (uu + vv) * (uu + vv))) return -INFINITY;
+    return s[3] * s[3] / s[0] + slopes[0] * ur + slopes[1] * vr;
+}
+
+/* For each set what its plane explains of the heights above it, and what those of two halves do at the best of CUTS cuts, whose
+   directions are (CUTS, 2): number of points, sum of squares, both figures; then the slopes of the halves. */
+EXPORT int64_t compare_halves(int64_t n, const int64_t *start, const double *points, const double *axes, const double *centre, const double *limit,
+                              const double *directions, int64_t least, double singular, double *found, double *slopes) {
+    for (int64_t i = 0; i < n; i++, axes += 9, centre += 3, found += 4, slopes += 4) {
+        double sectors[2 * CUTS][HALF_SUMS] = {{0}}, halves[2 * CUTS][HALF_SUMS] = {{0}}, all[HALF_SUMS], ignored[2];
+        double explained[2 * CUTS], tilts[2 * CUTS][2], level = centre[0] * axes[0] + centre[1] * axes[3] + centre[2] * axes[6];
+        for (const double *p = points + 3 * start[i]; p < points + 3 * start[i + 1]; p += 3) {
+            const double u = p[0] * axes[2] + p[1] * axes[5] + p[2] * axes[8], v = p[0] * axes[1] + p[1] * axes[4] + p[2] * axes[7];
+            const double r = p[0] * axes[0] + p[1] * axes[3] + p[2] * axes[6] - level;
+            if (!(fabs(r) <= limit[i])) continue;
+            const int turned = v > 0 || (v == 0 && u > 0), side = turned ? 1 : -1;
+            int sector = turned ? CUTS : 0;    /* as many as there are cuts up to its direction */
+            for (int k = 1; k < CUTS; k++) sector += side * (directions[2 * k] * v - directions[2 * k + 1] * u) >= 0;
+            const double values[HALF_SUMS] = {1, u, v, r, u * u, u * v, v * v, u * r, v * r, r * r};
+            for (int q = 0; q < HALF_SUMS; q++) sectors[sector][q] += values[q];
+        }
+        for (int k = 0; k < 2 * CUTS; k++) {
+            for (int part = 0; part < CUTS; part++)
+                for (int q = 0; q < HALF_SUMS; q++) halves[k][q] += sectors[(k + part) % (2 * CUTS)][q];
+            explained[k] = explain_heights(halves[k], least, singular, tilts[k]);
+        }
+        int best = 0;
+        for (int k = 1; k < CUTS; k++)
+            if (explained[k] + explained[k + CUTS] > explained[best] + explained[best + CUTS]) best = k;
+        for (int q = 0; q < HALF_SUMS; q++) all[q] = halves[0][q] + halves[CUTS][q];
+        found[0] = all[0];
+        found[1] = all[9];
+        found[2] = explain_heights(all, least, singular, ignored);
+        found[3] = explained[best] + explained[best + CUTS];
+        memcpy(slopes, tilts[best], sizeof tilts[best]);
+        memcpy(slopes + 2, tilts[best + CUTS], sizeof tilts[best]);
+    }
+    return 0;
+}
+
 enum { MOMENTS = 12 };                         /* of orders 2 to 4 */
 static const int POWERS[MOMENTS][2] = {
     {2, 0}, {1, 1}, {0, 2}, {3, 0}, {2, 1}, {1, 2}, {0, 3}, {4, 0}, {3, 1}, {2, 2}, {1, 3}, {0, 4},
