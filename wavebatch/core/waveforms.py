@@ -296,13 +296,16 @@ class WaveformBlock:
         Raises
         ------
         StageError
-            The samples are not unsigned integers, or not two-dimensional; the spacing is not positive.
+            The samples are not unsigned integers, not two-dimensional, or masked; the spacing is not positive.
         """
+        if hasattr(samples, "mask"):
+            raise StageError("samples are a masked array, and its mask would be ignored; give a plain array")
         samples = np.ascontiguousarray(samples)
-        if samples.ndim != 2 or samples.dtype.kind != "u":
-            raise StageError(f"samples must be unsigned integers (n, s), got {samples.dtype} {samples.shape}; shift "
+        if samples.ndim != 2 or not samples.shape[1] or samples.dtype.kind != "u" or samples.dtype.itemsize > 4:
+            kind = f"{samples.dtype} {samples.shape}"
+            raise StageError(f"samples must be unsigned integers (n, s) of up to 32 bits, got {kind}; shift "
                              "and round them, e.g. np.rint(samples).astype(np.uint16)")  # fmt: skip
-        if not 0 < spacing < np.inf:
+        if not (isinstance(spacing, int | float | np.number) and 0 < spacing < np.inf):
             raise StageError(f"spacing must be above 0 ns, got {spacing!r}")
         n, s = samples.shape
         samples = samples.view()

@@ -432,8 +432,9 @@ class Chain:
         self, block: WaveformBlock, system: SystemPulse, timing: dict[str, Seconds] | None = None
     ) -> tuple[WaveformBlock, Noise, SystemPulse]:
         """Return the block without the strip's defects, its noise, and the system of its digitizer."""
-        if not isinstance(system, SystemPulse):
-            raise TypeError(f"a chain runs with a block and a SystemPulse, such as survey.system, not {type(system)}")
+        if not (isinstance(block, WaveformBlock) and isinstance(system, SystemPulse)):
+            given = f"{type(block).__name__} and {type(system).__name__}"
+            raise TypeError(f"a chain runs with a WaveformBlock and a SystemPulse, such as survey.system, not {given}")
         if not 0 < system.noise.std < np.inf:
             raise ConfigError(f"noise.std of a SystemPulse must be above 0 counts, got {system.noise.std}")
         system = system.of(block)

@@ -394,6 +394,9 @@ def survey(
         sample = list(strip) if isinstance(strip, Iterable) else [strip]
         if not all(isinstance(block, WaveformBlock) for block in sample):
             raise ConfigError("survey: give a strip, its path, or blocks of waveforms by `WaveformBlock.from_samples`")
+        kinds = {(block.digitizer.index, block.digitizer.bits, block.spacing) for block in sample}
+        if len({index for index, _, _ in kinds}) < len(kinds):
+            raise ConfigError("survey: the spacing or the bits of blocks of one digitizer differ; survey them apart")
         if not any(map(len, sample)):
             raise InputError("these blocks hold no waveform to be surveyed")
         return _with_decisions(with_look(survey_blocks(sample), sample))
