@@ -169,6 +169,33 @@ def test_neighbours_among_clipped_echoes_are_no_misfit():
     assert found > 0.995 and true > 0.995
 
 
+def amplify(signal, linear, top):
+    """What an amplifier makes of a signal that it clips at `top`, and compresses from `linear` on."""
+    room = max(top - linear, 1e-9)
+    return np.where(signal > linear, linear + room * np.tanh((signal - linear) / room), signal)
+
+
+@pytest.mark.parametrize("linear", [120, 85])
+def test_tops_that_an_amplifier_clips_have_noise_and_are_one_echo(linear):
+    """Below the range of the digitizer: no count repeats, and noise made two echoes of each top."""
+    signal, rows, time, height = render(bell, 31, n=600, amplitude=(15, 400), second=0.3)
+    block = digitize(amplify(signal, linear, 120), 31)
+    system, found, true = scores(block, rows, time)
+    assert 0.65 * 120 < system.saturation - BASE < 0.95 * 120 and block.samples.max() > 120 + BASE
+    assert found > 0.99 and true > 0.985
+    own = load_profile("accurate").run(block, system)
+    assert (own.flags[own.amplitude > 150] & np.uint16(EchoFlag.SATURATED)).all()
+
+
+@pytest.mark.parametrize("wide", [1.0, 3.0])
+def test_targets_of_one_brightness_are_not_clipped(wide):
+    """Half of the echoes are as high as the highest ones, as a road is, and lie over weaker, narrower ones."""
+    weak, bright = render(bell, 32, n=300, amplitude=(15, 100))[0], render(bell, 33, n=300, width=2 * wide)
+    noise = np.random.default_rng(33).normal(1, 0.01, (300, 1))
+    high = 120 * noise * bell((np.arange(80) - bright[2][:, None]) / (2 * wide))
+    assert survey_block(digitize(np.concatenate([weak, high]), 32)).system.saturation is None
+
+
 def test_spikes_of_one_sample_are_no_echoes():
     signal, rows, time, _ = render(bell, 5, second=0.4)
     rng = np.random.default_rng(5)

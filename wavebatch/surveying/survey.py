@@ -182,7 +182,9 @@ def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock
     alike = abs(other.noise.baseline - plain.noise.baseline) < slack
     for ratio, most in ((other.noise.std / plain.noise.std, 1.2), (other.sigma_ref / plain.sigma_ref, 1.04)):
         alike &= 1 / most < ratio < most
-    return bool(alike and (other.saturation or main.digitizer.max_count) == clip_level(main, plain))
+    # Where an amplifier clips, its level is measured: to a hundredth.
+    clips = (other.saturation or main.digitizer.max_count) / clip_level(main, plain)
+    return bool(alike and abs(clips - 1) < 0.01)
 
 
 def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> SystemPulse:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.order import find_order, median
+from wavebatch.core.order import find_order, median, quantile
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
@@ -86,6 +86,21 @@ MIN_SNR = 20.0
 LOOSE = 1.5
 """How far amplitudes of candidates may be off: waveforms in which no fit can be alone are not fitted."""
 
+TOP_STEP, PILED, SMALL_PILE = 0.9, 2, 60
+"""Share of the height of the highest FEW waveforms from which others are as high; how many more these are than those a
+step below; waveforms from which that is looked for. Heights of echoes thin out towards the highest ones."""
+
+POINTED = 0.456
+"""Width of a Gaussian at three quarters of its height, over that at a quarter: echoes near others seem more pointed."""
+
+FLATTER, MIDDLE, LEAST_TOP, MOST_TOPS = 1.05, 0.6, 0.2, 1024
+"""Flatness of the tops over that of all but the flattest lower ones, from which an amplifier clips them: it is 1.02 at
+most in strips that do not, 1.25 where those of echoes up to twice as high are cut. Shares of the height below which,
+and from which, waveforms are lower ones; and how many are looked at."""
+
+QUIET_FROM = 3
+"""Widths from an echo from which samples are quiet."""
+
 STEPS = 4
 """Gauss-Newton steps of a fit."""
 
@@ -107,12 +122,12 @@ def measure_begin(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPul
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
             break
-        reach = _reach(width)
+        reach = int(np.ceil(QUIET_FROM * width))
         if reach not in noises:
             noises[reach] = _find_noise(few, width)
         last = width
         width = _isolated_width(few, _gaussian_system(noises[reach], few.spacing, width, saturation))
-    return _gaussian_system(noises[reach], block.spacing, width, saturation)
+    return find_flat_tops(block, _gaussian_system(noises[reach], block.spacing, width, saturation))
 
 
 def measure_whole(block: WaveformBlock, begin: SystemPulse, *, cleaned: bool = False) -> SystemPulse:
@@ -146,7 +161,8 @@ def list_widths(block: WaveformBlock) -> list[float]:
 def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
     """A Gaussian of a width that is known [samples], and the noise outside of the echoes."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)
-    return _gaussian_system(_find_noise(thin_samples(block, NOISE_LOOK), width), block.spacing, width, saturation)
+    noise = _find_noise(thin_samples(block, NOISE_LOOK), width)
+    return find_flat_tops(block, _gaussian_system(noise, block.spacing, width, saturation))
 
 
 def measure_once_more(block: WaveformBlock, system: SystemPulse) -> ReceiverNoise:
@@ -202,15 +218,11 @@ def thin_samples(block: WaveformBlock, number: int) -> WaveformBlock:
     return thin_block(block, max(number // block.samples.shape[1], LEAST_LOOK))
 
 
-def _reach(width: float) -> int:
-    """Samples next to an echo of this width [samples] that are not quiet."""
-    return int(np.ceil(3 * width))
-
-
 def _find_noise(block: WaveformBlock, width: float, recovery: int = 0) -> PooledNoise:
     """Noise outside of echoes of this width [samples]; recovery: as for `estimate_noise`."""
     missing = None if block.missing is None else keep_longest(block.missing.T)
-    return estimate_noise(transpose_samples(block.samples), _reach(width), missing=missing, recovery=recovery)
+    reach = int(np.ceil(QUIET_FROM * width))
+    return estimate_noise(transpose_samples(block.samples), reach, missing=missing, recovery=recovery)
 
 
 def _noise_of_pulse(std: float, correlation: tuple[float, ...], width: float) -> tuple[float, float]:
@@ -303,6 +315,51 @@ def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
         return float(top)
     reached = at_top.any(axis=1).sum()
     return float(top) if flat.sum() >= max(3, 0.5 * reached) and reached >= 5 else None
+
+
+def find_flat_tops(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
+    """The system with `saturation` where an amplifier clips before the converter, so that flat tops have noise (H6).
+
+    Many waveforms are then as high as the highest ones, and flatter than lower ones. Targets of one brightness are as
+    high too, but as pointed. Flatness is the width of a waveform's highest peak at three quarters of its height over
+    that at a quarter, which targets do not change.
+    """
+    level = system.noise.baseline
+    height = block.samples.max(axis=1) - np.float32(level)
+    open_top = height < (np.inf if system.saturation is None else system.saturation - level)
+    if np.count_nonzero(open_top) < SMALL_PILE:
+        return system
+    top = float(np.partition(height[open_top], -FEW)[-FEW])
+    share = np.where(open_top, height / max(top, 1e-9), 0.0)
+    piled, under = np.count_nonzero(share >= TOP_STEP), np.count_nonzero(share >= 2 * TOP_STEP - 1)
+    if top < MIN_SNR * system.noise.std or piled < PILED * (under - piled):
+        return system
+    rows = np.flatnonzero((share > LEAST_TOP) & (height > 0.5 * MIN_SNR * system.noise.std))
+    rows = rows[spread_rows(len(rows), MOST_TOPS)]
+    signal, share, height = block.samples[rows] - np.float32(level), share[rows], height[rows]
+    row, place, peak, widths = np.arange(len(rows)), np.arange(signal.shape[1]), signal.argmax(axis=1)[:, None], []
+    for part in (0.75, 0.25):
+        low = signal < part * height[:, None]
+        before = np.where(low & (place < peak), place, -1).max(axis=1)
+        after = np.where(low & (place > peak), place, len(place)).min(axis=1)
+        whole = (before >= 0) & (after < len(place))
+        before, after = np.maximum(before, 0), np.minimum(after, len(place) - 1)
+        width = (after - before).astype(np.float64)
+        for at, step in ((before, 1), (after, -1)):  # between two samples, as a line between them
+            rise = np.maximum(signal[row, at + step] - signal[row, at], 1e-9)
+            width -= (part * height - signal[row, at]) / rise
+        widths.append(np.where(whole, width, 0.0))
+    flat = widths[0] / np.maximum(widths[1], 1e-9)
+    lower, highest = flat[(share < MIDDLE) & (flat > 0)], flat[share >= TOP_STEP]
+    if min(len(lower), len(highest)) < FEW or median(highest) < max(FLATTER * quantile(lower, 0.84), POINTED):
+        return system
+    clip = TOP_STEP
+    while clip > MIDDLE:  # what an amplifier compresses before it clips is as wrong
+        under = flat[(share >= clip + TOP_STEP - 1) & (share < clip)]
+        if len(under) < FEW or median(under) < FLATTER * median(lower):
+            break
+        clip += TOP_STEP - 1
+    return replace(system, saturation=level + min(clip * top, top - 4 * system.noise.std))
 
 
 def fit_lone(block: WaveformBlock, noise: Noise, system: SystemPulse, least: float, fraction: float = 0.2) -> EchoTable:
