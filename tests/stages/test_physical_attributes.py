@@ -549,9 +549,10 @@ def test_returns_off_the_ray_are_in_the_errors_of_their_echoes(aside, held):
     assert place([20.0], [20.0], aside=5.0)[1] == pytest.approx(ERROR, rel=1e-3)
 
 
-def test_returns_have_their_scatter_and_echoes_without_one_the_phase():
-    errors = {"returns": 0.03 * HALF_C, "phase": 0.29 * HALF_C}
-    for locations, other in (([19.6], 0.03), ([19.6, 39.6], 0.03), ([19.6, 38.6], 0.5), ([99.0], 0.29)):
+def test_returns_have_their_scatter_and_echoes_without_one_the_phase_or_how_far_it_is():
+    errors = {"returns": 0.03 * HALF_C, "phase": 4.0 * HALF_C}
+    cases = (([19.6], 0.03), ([19.6, 39.6], 0.03), ([19.6, 38.6], 0.5), ([43.2], 4.0), ([99.0], 59.0), ([0, 8.0], 12.0))
+    for locations, other in cases:
         _, error = place([20.0, 40.0], locations, **errors)
         assert error == pytest.approx(np.hypot(ERROR, other), rel=1e-3)
 

@@ -5,10 +5,11 @@ import json
 import footprints
 import numpy as np
 import pytest
-from commands import run_command
+from commands import run_command, succeed
 from footprints import EAST, NORTH, Flight, Plane, match, roofs, write_strip
 
 import wavebatch as wb
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.measuring.return_scatter import ReturnScatter, _measure, _sample, measure_returns
 
@@ -77,17 +78,23 @@ def test_rounded_coordinates_are_in_the_scatter(tmp_path, edit_points, values):
     assert rounding == (found.source == "rounding") == (values is None), found
 
 
-@pytest.mark.parametrize(("wrong", "phase"), [(1.0, 1.5), (0.3, 0.005)], ids=["most", "some"])
-def test_locations_that_are_wrong_are_in_the_phase(tmp_path, edit_points, wrong, phase):
-    """10 ns too late in all packets: echoes were 1.5 m off with errors of 1 mm, since no return was at an echo."""
+@pytest.mark.parametrize(("wrong", "late"), [(1.0, 10.0), (0.1, -15.0)], ids=["all", "some"])
+def test_locations_that_are_wrong_are_in_the_errors_of_their_echoes(tmp_path, edit_points, wrong, late):
+    """10 ns too late in all packets, or 0 in a tenth: echoes were 1.5 to 3 m off with errors of 1 mm."""
 
     def delay(points):
-        late = np.random.default_rng(1).random(len(points)) < wrong
-        points["return_point_wave_location"] += 1e4 * late.astype("f4")
+        rows = np.random.default_rng(1).random(len(points)) < wrong
+        points["return_point_wave_location"] += 1e3 * late * rows.astype("f4")
         return points
 
     write_strip(tmp_path / "a.las", TOWN, Flight(point_error=0.005), 3000, 3)
-    assert measure(edit_points(tmp_path / "a.las", tmp_path / "b.las", delay)).phase == pytest.approx(phase, rel=0.2)
+    strip = edit_points(tmp_path / "a.las", tmp_path / "b.las", delay)
+    succeed("run", strip, "-o", tmp_path / "out", "--profile", "fast", "--columns", "range_err,echo_flags")
+    cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
+    lost = (cloud["echo_flags"] & EchoFlag.UNANCHORED) != 0
+    assert lost.sum() > 0.8 * wrong * 3000
+    assert np.median(cloud["range_err"][lost]) == pytest.approx(0.15 * abs(late), rel=0.05)
+    assert wrong == 1.0 or np.nanmedian(cloud["range_err"][~lost]) < 0.01
 
 
 def test_scatter_and_phase_are_printed_and_in_the_report(tiny_strip, tmp_path):

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 
+import footprints
 import laspy
 import numpy as np
 import pytest
@@ -111,6 +112,29 @@ def test_a_hillside_without_level_ground_has_right_angles(tmp_path, slope):
     for name in ("incidence_angle", "incidence_angle_normals"):
         check(columns, name, true["incidence"], everywhere)
     check(columns, "reflectance", true["reflectance"], everywhere)
+
+
+@pytest.mark.parametrize("rough", [0.0, 0.05])
+def test_rough_ground_that_reads_as_a_slope_is_in_the_errors(tmp_path, monkeypatch, rough):
+    """Grass 5 cm high on half of a level field made angles 10 degrees too large, with errors of .8."""
+    rng, meet, calls = np.random.default_rng(4), footprints.meet, []
+
+    def ruffle(origin, unit, planes):
+        distance, facing, plane = meet(origin, unit, planes)
+        calls.append(0)
+        # Only the light is scattered by it, not where the middle of the footprint is.
+        high = rough * rng.standard_normal(distance.shape) * (plane == 0) if len(calls) == 1 else 0.0
+        return distance + high, facing, plane
+
+    monkeypatch.setattr(footprints, "meet", ruffle)
+    planes = [Plane(0.25, inside=lambda x, y: np.sin(y / 9) > 0), Plane(0.25)]
+    columns, true, _ = fly(tmp_path, planes, GREEN, 6000, "--columns", "incidence_angle,incidence_angle_err")
+    angle, error = columns["incidence_angle"], columns["incidence_angle_err"]
+    off = np.abs(angle - true["incidence"])
+    for plane in (0, 1):
+        rows = (true["plane"] == plane) & true["pure"] & np.isfinite(angle)
+        assert rows.sum() > 2000 and np.mean(off[rows] < error[rows]) > 0.55
+        assert (np.median(error[rows]) < 2.5) == (rough == 0)
 
 
 def test_without_surfaces_of_known_slope_there_is_no_angle_but_a_sentence(tmp_path):

@@ -33,6 +33,7 @@ from wavebatch.files.disk.temp_store import SPOOL_MEMORY, STORE_PIECE, RowStore,
 from wavebatch.files.las.header import field_names
 from wavebatch.kernels.geometry import normals
 from wavebatch.stages.chain import Step
+from wavebatch.surveying.sensor import LARGEST_MISS
 
 TILE_POINTS = 150_000
 """Points of a tile without its buffer, roughly."""
@@ -205,7 +206,16 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
     x, y, z = echoes.direction.T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         length = np.sqrt(x * x + y * y + z * z)
-        ray = (echoes.direction / length[:, None]).astype(np.float32)[echoes.table.waveform]
+        unit = (echoes.direction / length[:, None]).astype(np.float32)
+    sensor = prepared.sensor
+    if sensor.kind == "direction vectors" and sensor.distance is not None:
+        # The vectors of most pulses meet in the path. Those of a stretch that do not are no directions of its rays.
+        most = (LARGEST_MISS + np.radians(sensor.turned)) * sensor.distance
+        for index, (block, *_) in solved:
+            if block.sensor is not None:
+                miss = np.square(np.cross(block.origin - block.sensor, unit[index])).sum(axis=1)
+                unit[index[~(miss < most * most)]] = np.nan
+    ray = unit[echoes.table.waveform]
     entries["ray"] = np.append(ray, np.full((1, 3), np.nan, np.float32), axis=0)[made.echo]
     return (entries, state), RunReport(timing=timing)
 

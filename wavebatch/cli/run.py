@@ -139,7 +139,7 @@ def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:
     if returns := sensor.get("returns"):
         yield (
             f"returns were placed to {returns['scatter_m']:.3f} m, by {returns['from']}; an echo without a return is "
-            f"off by {returns['phase_m']:.3f} m"
+            f"off by {returns['phase_m']:.3f} m, or as far as the nearest return of its packet is from an echo"
         )
 
 

@@ -382,7 +382,11 @@ class NoData(IntEnum):
         "raise max_error, or take angles from the points around (stage attribute.incidence_angle_normals)",
     )
     OTHER = 13, "its fit gave no usable value", "see its flags"
-    NO_RAY = 14, "its packet has no direction, or it is not a point of the cloud", "write --points echoes"
+    NO_RAY = (
+        14,
+        "its packet has no direction, or one that misses the path of the sensor, or it is not a point of the cloud",
+        "write --points echoes",
+    )
     FEW_NEIGHBOURS = 15, "fewer points around it than min_points, or only one or two scan lines", "raise radius"
     NO_PLANE = 16, "the points around it do not form a plane that it lies in", "lower radius; plants have no plane"
     OTHER_PULSE = (

@@ -110,6 +110,10 @@ class LevelWidths:
         float, Range(0.0, 1e4), Key("width_scatter_ns", "of echo widths beyond the errors of their fits")
     ] = 0.0
     """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
+    rough: Annotated[
+        float | None, Range(0.0, 1e8), Key("level_roughness_ns2", "variance that 84 % of rough ground adds at most")
+    ] = None
+    """Variance that rough ground adds as slopes do, at most on 84 % of the surfaces [ns2]; None where none is seen."""
 
 
 @frozen

@@ -309,7 +309,10 @@ def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
     excess = median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
     scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
     level_err = float(np.hypot(level_err, 2.0 * square * median(lever) * system.radiometry.divergence_error))
-    return replace(system, widths=LevelWidths(level, level_err, scatter))
+    # Grass and gravel widen echoes as slopes do. Errors alone reach their double on a fortieth of the surfaces.
+    rough = quantile(variance - level, 0.84)
+    seen = rough > 2.0 * quantile(error, 0.84)
+    return replace(system, widths=LevelWidths(level, level_err, scatter, rough if seen else None))
 
 
 def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:

@@ -182,7 +182,7 @@ def position(
     fit, range_err has that of the returns: their scatter in this strip, or, where the returns of a packet contradict
     each other by more, the error of their mean. Returns that lie off the packet's ray by more than a sample (bent at
     a water surface) put that into it. Packets without a matched return keep the raw location and are flagged;
-    their error has what locations differ from echoes.
+    their error has what locations differ from echoes in the strip, and how far their nearest return is from an echo.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def position(
     offset = np.zeros(len(block))
     doubt = np.zeros(len(block))
     known = np.zeros(len(block), bool)
-    most, bent = np.zeros(len(block)), np.zeros(len(echoes))
+    most, bent, apart = np.zeros(len(block)), np.zeros(len(echoes)), np.zeros(len(block))
     point = np.full(len(echoes), -1, np.int64)
     returns = block.returns
     if returns is not None and len(returns):
@@ -219,6 +219,14 @@ def position(
             away[away <= block.spacing] = 0.0  # a location may be rounded to a sample
             np.maximum.at(most, returns.waveform, away)
             bent = np.where(match >= 0, away[match], most[waveform])
+        # Of returns far from all echoes of their packet, place or location may be wrong: as the nearest two differ.
+        strange = np.flatnonzero(~known[returns.waveform])
+        if len(strange):
+            of, time = returns.waveform[strange], returns.time[strange]
+            match = match_returns(waveform, echoes.time, of, time, np.inf)
+            found = np.flatnonzero(match >= 0)
+            apart[waveform[found]] = np.inf
+            np.minimum.at(apart, waveform[found], np.abs(echoes.time[found] - time[match[found]]))
     along = echoes.time - offset[waveform]
     # `take` copies whole rows: a tenth of the time of an index.
     xyz = block.origin.take(waveform, axis=0) + block.direction.take(waveform, axis=0) * along[:, None]
@@ -226,7 +234,8 @@ def position(
     speed = np.sqrt(east**2 + north**2 + up**2)
     # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
-    shared = np.where(known, np.maximum(doubt * speed, system.radiometry.returns), system.radiometry.phase)
+    shared = np.where(known, np.maximum(doubt * speed, system.radiometry.returns),
+                      np.maximum(apart * speed, system.radiometry.phase))  # fmt: skip
     echoes = echoes.with_attributes(
         x=xyz[:, 0],
         y=xyz[:, 1],
@@ -337,6 +346,12 @@ def incidence_angle(
         known = variance[clear], variance_err[clear], distance[clear]
         angle[clear], error[clear] = incidence.angles_above(*known, 1e-3 * beam if beam else np.nan, CLEAR_ERRORS)
     error = np.hypot(error, 0.5 * np.sin(2.0 * angle) * system.radiometry.divergence_error)
+    # Without what rough ground may have added the surface is less steep.
+    steepest, least = (
+        incidence.angle_of_spread(np.sqrt(np.maximum(variance - part, 0.0)), distance, 1e-3 * beam if beam else np.nan)
+        for part in (0.0, system.widths.rough or 0.0)
+    )
+    error = np.hypot(error, steepest - least)
     unproven = np.isinf(system.widths.error or 0.0)
     # Widths that were fitted with another pulse than the mode compares them with: angles would be off by degrees.
     other = system.other_pulse

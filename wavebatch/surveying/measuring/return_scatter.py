@@ -83,12 +83,8 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
     parts = list(_sample(reader, scan, system))
     if not parts:
         return ReturnScatter()
-    neighbours, pairs, offsets, astray = (np.concatenate(kind, axis=-1) for kind in zip(*parts, strict=True))
-    # Where most lone returns are not at the lone echo of their packet, locations are wrong, and not some echoes.
-    if len(astray) > offsets.shape[1]:
-        phase = HALF_C * float(median(np.abs(astray)))
-    else:
-        phase = HALF_C * float(np.sqrt(np.mean(offsets[0] ** 2))) if offsets.size else 0.0
+    neighbours, pairs, offsets = (np.concatenate(kind, axis=-1) for kind in zip(*parts, strict=True))
+    phase = HALF_C * float(np.sqrt(np.mean(offsets[0] ** 2))) if offsets.size else 0.0
     offsets[0] -= median(offsets[0]) if offsets.size else 0.0
     kinds = {"neighbours": neighbours, "pairs of returns": pairs, "locations": offsets}
     found = {name: _measure(residuals) for name, residuals in kinds.items()}
@@ -125,8 +121,7 @@ def _measure(residuals: np.ndarray) -> float | None:
 
 
 def _sample(reader: StripReader, scan: StripScan, system: SystemPulse) -> Iterator[tuple[np.ndarray, ...]]:
-    """Residuals of runs of packets (3, k), as for `_measure`: of neighbours, pairs and locations [ns]; and by how much
-    lone echoes differ from the lone return of their packet, where that is not theirs (k,)."""
+    """Residuals of runs of packets (3, k), as for `_measure`: of neighbours, pairs and locations [ns]."""
     chosen = even_places(reader.unit_count(), RUNS).tolist()
     for number in chosen:
         unit = reader.read_unit(number, scan)
@@ -159,10 +154,7 @@ def _compare(
     offsets = np.stack([offset, np.ones(len(rows)), error])
 
     number = np.bincount(returns.waveform, minlength=len(block))
-    alone = echoes.alone(len(block)) & (number[echoes.waveform] == 1)
-    first = (np.cumsum(number) - number)[echoes.waveform]
-    astray = (echoes.time - returns.time[np.where(alone, first, 0)])[alone & (match < 0)]
-    lone = alone[rows]
+    lone = (echoes.alone(len(block)) & (number[echoes.waveform] == 1))[rows]
     waveform, error, place = waveform[lone], error[lone], returns.xyz[match[rows[lone]]]
     order = np.lexsort((block.gps_time[waveform], run[waveform]))
     error, place, run, ray = error[order], place[order], run[waveform[order]], block.direction[waveform[order]][1:-1]
@@ -176,4 +168,4 @@ def _compare(
     before, after = (1.0 - share) ** 2, share**2
     fits = np.sqrt(error[1:-1] ** 2 + before * error[:-2] ** 2 + after * error[2:] ** 2)
     neighbours = np.stack([off, 1.0 + before + after, fits])[:, between]
-    return neighbours, pairs, offsets, astray
+    return neighbours, pairs, offsets
