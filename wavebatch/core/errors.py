@@ -45,6 +45,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 WARNINGS = {
     "header": "header, descriptors or the place of the packets are wrong; the strip is read all the same",
     "packets": "packets, or the vectors of their points, are unusual; they are used",
+    "lost-points": "the header claims fewer points than the file seems to hold: the others are not read",
     "lost-packets": "points whose packets cannot be used: they are written without attributes",
     "foreign-packets": "the packets, or the return locations, do not belong to the points",
     "empty": "no points, no waveforms or no echoes",

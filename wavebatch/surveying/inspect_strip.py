@@ -191,7 +191,8 @@ def name_gains(facts: StripFacts, scan: StripScan) -> Iterator[str]:
 
 def doubt_files(facts: StripFacts, scan: StripScan) -> Iterator[StripWarning]:
     """What is odd about the files of a strip that can be processed."""
-    yield from StripWarning.of("header", facts.warnings)
+    for line in facts.warnings:
+        yield StripWarning("lost-points" if line in facts.unread else "header", line)
     losses = tuple(describe_oddities(scan.reasons, 0))  # points whose packets cannot be used
     for line in scan.warnings:
         yield StripWarning("lost-packets" if line in losses else "packets", line)

@@ -87,7 +87,8 @@ def export_strip(
         elif scan.vectors.direction == "away":
             repaired.append("packet vectors pointed away from the sensor; they point toward it")
         if scan.broken:
-            repaired.append(f"{count(scan.broken, 'point')} had packets that cannot be used; they have none")
+            lost = f"packets of {count(scan.broken, 'point')} cannot be used and are left out; `wavebatch check` says why"
+            repaired.append(f"warning: {lost}")
         if scan.short:
             repaired.append(
                 f"{count(scan.short, 'point')} had packets shorter than their descriptor; now descriptors fit"

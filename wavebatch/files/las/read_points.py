@@ -43,6 +43,8 @@ class CheckedHeader:
     points_end: int
     """Byte at which the points end: exact for LAS; for LAZ the start of what follows them."""
     warnings: tuple[str, ...]
+    unread: tuple[str, ...]
+    """Those of them that say that points are not read."""
 
     @property
     def version(self) -> str:
@@ -98,7 +100,7 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     for what, at in followers.items():
         if start <= at <= header.file_size - las.EVLR_HEADER_SIZE and at < points_end:
             points_end, limit = at, what
-    warnings: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
     if not header.compressed:
         room, points_end = points_end, start + header.point_count * header.point_length
         if points_end > room:
@@ -111,16 +113,17 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
         room = header.waveform_start if points_end <= header.waveform_start < room else room
         if more := (room - points_end) // header.point_length:
             # A program that was stopped writes its points, but not their number.
-            warnings = (f"the header claims {header.point_count} points, which leaves room for {more} more before "
-                        f"{limit}; what is there is not read: if points are missing, get the strip again",)  # fmt: skip
+            unread = (f"the header claims {header.point_count} points, which leaves room for {more} more before "
+                      f"{limit}; what is there is not read: if points are missing, get the strip again",)  # fmt: skip
     elif (returns := sum(header.by_return)) > header.point_count:  # the size of the last chunk does not say how many
-        warnings = (f"the header claims {header.point_count} points, but {returns} by return number; no more are "
-                    "read: if points are missing, get the strip again",)  # fmt: skip
+        unread = (f"the header claims {header.point_count} points, but {returns} by return number; no more are "
+                  "read: if points are missing, get the strip again",)  # fmt: skip
+    warnings = unread
     legacy, count = header.counts
     if header.version >= (1, 4) and legacy and legacy != count:
         used = "64-bit" if count else "legacy"
         warnings += (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
-    return CheckedHeader(path, header.file_size, header, dtype, records, points_end, warnings)
+    return CheckedHeader(path, header.file_size, header, dtype, records, points_end, warnings, unread)
 
 
 LASZIP_USER, LASZIP_ID = "laszip encoded", 22204
