@@ -66,7 +66,8 @@ def test_what_a_strip_lacks_is_named_by_all_that_read_packets(tmp_path, command)
     raw = make_raw(60)
     raw.count = len(raw.points) - 3
     raw.points["wavepacket_offset"][5] = 1
-    more = {"run": ["out", "--profile", "fast"], "slice": ["a.csv"], "voxelize": ["a.npz", "--size", "2"], "export": ["a.las"]}[command]
+    more = {"run": ["out", "--profile", "fast"], "slice": ["a.csv"], "voxelize": ["a.npz", "--size", "2"],
+            "export": ["a.las"]}[command]  # fmt: skip
     strip = raw.write(tmp_path / "strip.las")
     for quiet in ([], ["-q"]):
         said = succeed(command, strip, "-o", tmp_path / more[0], *more[1:], "--overwrite", *quiet).stderr

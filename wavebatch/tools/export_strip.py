@@ -87,7 +87,7 @@ def export_strip(
         elif scan.vectors.direction == "away":
             repaired.append("packet vectors pointed away from the sensor; they point toward it")
         if scan.broken:
-            lost = f"packets of {count(scan.broken, 'point')} cannot be used and are left out; `wavebatch check` says why"
+            lost = f"packets of {count(scan.broken, 'point')} cannot be used: left out; `wavebatch check` says why"
             repaired.append(f"warning: {lost}")
         if scan.short:
             repaired.append(
