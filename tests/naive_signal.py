@@ -155,6 +155,18 @@ def colour_factors(correlation, *columns):
     return tuple(np.sqrt(np.diag(rows @ colour @ rows.T) / np.diag(rows @ rows.T)))
 
 
+def fit_factors(joint, by_amplitude, by_time, taps, correlation):
+    """The same of a fit that may whiten, with the energy; then what a level that is 1 too high does: by matrices."""
+    size = joint.shape[1]
+    taps = np.ones(1) if taps is None else taps
+    white = sum(np.eye(size + len(taps) - 1, size, -later) * tap for later, tap in enumerate(taps))
+    changes = np.array([[1, 0, by_amplitude], [0, 1, by_time], [0, 0, 1], [1, 0, 1]])
+    rows = changes @ np.linalg.pinv(white @ joint.T)
+    weights, given = rows @ white, np.sum(rows * rows, axis=1)
+    colour = toeplitz(np.r_[1.0, correlation, np.zeros(size)][:size])
+    return np.r_[np.diag(weights @ colour @ weights.T) / given, weights.sum(axis=1) / np.sqrt(given)]
+
+
 def wiener(waveform, taps, noise_to_signal):
     """One waveform deconvolved by the linear estimate of least mean square error for white signal and noise."""
     pulse = naive.pulse_matrix(len(waveform), taps)

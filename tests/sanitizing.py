@@ -34,9 +34,10 @@ from wavebatch.kernels.fit.decompose import (
 )
 from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
+from wavebatch.kernels.geometry.planes import Planes, compare_halves
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_correlated, find_maxima, quiet_levels
-from wavebatch.kernels.signal.noise import coloured_variance, measure_covariance
+from wavebatch.kernels.signal.noise import coloured_variance, fit_factors, measure_covariance
 
 FLAGS = ("-g", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
 SETTINGS = {
@@ -229,20 +230,21 @@ def add_up(rng: np.random.Generator) -> None:
     """The functions of sets of points, weights and pairs of samples: none, one or many of them, some no number."""
     sizes = rng.choice([0, 0, 1, 2, 3, 4, 5, 9, 40], rng.integers(0, 6))
     n, k, start = len(sizes), int(sizes.sum()), np.r_[0, np.cumsum(sizes)].astype(np.int64)
-    xyz, axes, spreads = rng.normal(0, 1, (k, 3)), rng.normal(0, 1, (n, 3, 3)), rng.random((n, 3))
-    for values in (xyz, axes, spreads):
-        odd = rng.random(values.shape) < rng.choice([0.0, 0.1, 1.0])
-        values[odd] = rng.choice([*ODD, np.nan, np.inf], np.count_nonzero(odd))
-    whole, counts, limit = np.zeros((n, 10)), np.ones(k, np.bool_), np.full(n, np.inf)
-    found = whole, counts, limit, np.empty((n, 3)), np.empty((n, 3, 3)), np.full(n, 3, np.uint8)
+    xyz = rng.normal(0, 1, (k, 3))
+    odd = rng.random(xyz.shape) < rng.choice([0.0, 0.1, 1.0])
+    xyz[odd] = rng.choice([*ODD, np.nan, np.inf], np.count_nonzero(odd))
+    kept, limit = np.empty(n, np.int64), np.empty(n)
     factors = (ctypes.c_double(value) for value in (0.0025, rng.choice([0.0, 1.5]), 6.0, 1e-3))
-    settings = ctypes.c_int64(n), start, xyz, *factors
-    for _ in range(4):
-        library.call("trim_planes", *settings, axes, spreads, *found)
-    assert (found[-1] <= 2).all() and counts.sum() <= k
+    settings = ctypes.c_int64(n), start, xyz, *factors, *map(ctypes.c_int64, (3, 4))
+    library.call("trim_planes", *settings, np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), kept, limit)
+    assert (kept <= sizes).all()
+    planes = Planes(rng.normal(0, 1, (n, 3, 3)), np.ones((n, 3)), rng.normal(0, 1, (n, 3)), kept, limit)
+    compare_halves(xyz, np.repeat(np.arange(n), sizes), planes)
     r, s, lags = (int(rng.choice([0, 1, 2, 3, 9, 30])) for _ in range(3))
     weights, correlation = rng.choice([*ODD, np.nan], (r, s)), rng.normal(0, 1, lags)
     assert coloured_variance(weights, correlation).shape == (r,)
+    if r >= 3:
+        fit_factors(weights[:3], 0.1, -0.1, rng.normal(0, 1, 3) if r > 3 else None, tuple(correlation))
     signal = rng.normal(12, 1, (s, int(rng.choice([0, 1, 7, 100])))).astype(np.float32)
     signal[rng.random(signal.shape) < rng.choice([0.0, 0.1, 1.0])] = np.nan
     quiet, high, low = (rng.random(signal.shape) < rng.choice([0.0, 0.5, 1.0]) for _ in range(3))

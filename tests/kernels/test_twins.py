@@ -239,6 +239,14 @@ def test_coloured_noise_widens_errors_as_its_covariance_says():
     assert noise_kernels.colour_factors((), *columns) == (1.0, 1.0, 1.0, 1.0)
 
 
+@pytest.mark.parametrize("taps", [None, [1.3, -0.6, 0.2]])
+def test_factors_of_errors_are_those_of_matrices(taps):
+    x = np.arange(-12, 13) / 2.0
+    pulse = np.exp(-0.5 * x * x) + 0.1 * np.exp(-0.5 * (x - 3) ** 2)
+    given = np.stack([pulse, x * pulse, x * x * pulse]), 0.3, -0.2, taps and np.array(taps), (0.5, 0.2, -0.05)
+    assert noise_kernels.fit_factors(*given) == pytest.approx(naive_signal.fit_factors(*given))
+
+
 def test_sums_of_coloured_samples_vary_as_their_matrix_says(rng):
     for correlation, size in (((0.5, 0.2), 7), ((0.6, 0.3, 0.1, -0.1), 3), ((), 4), ((0.9,), 1)):
         rows = rng.standard_normal((3, size))

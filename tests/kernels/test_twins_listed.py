@@ -36,6 +36,8 @@ COMPILED = {
     "find_two_lines": ("in_two_lines", "test_hough.on_two_lines"),
     "trim_planes": ("fit_planes", "test_planes.naive_plane"),
     "coloured_variance": ("colour_factors", "naive_signal.colour_factors"),
+    "compare_halves": ("compare_halves", "naive.compare_halves"),
+    "fit_factors": ("fit_factors", "naive_signal.fit_factors"),
     "find_around": ("Surroundings", "test_planes._neighbours_by_loop"),
 }  # fmt: skip
 """Function of the library, the kernel that calls it, and the twin that a test compares that with."""

@@ -24,7 +24,8 @@ FUNCTIONS = (
     "describe_widths", "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes", "match_returns", "weigh_fits",
     "finish_echoes", "find_pulses", "find_nearest", "number_returns", "share_offsets", "find_around",
-    "measure_lobes", "find_two_lines", "trim_planes", "coloured_variance",
+    "measure_lobes", "find_two_lines", "trim_planes", "coloured_variance", "fit_factors",
+    "compare_halves",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 

@@ -17,7 +17,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import exp, interpolate, log, solve
+from wavebatch.kernels.elementary import exp, interpolate, log
 from wavebatch.kernels.fit.decompose import NO_ROWS, STRETCHED, SUMMED, WholePulse, describe_whole
 from wavebatch.kernels.fit.pulse_shape import (
     GAUSSIAN,
@@ -29,7 +29,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     measure_pulse,
 )
 from wavebatch.kernels.signal.filters import refine_peaks
-from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, coloured_variance, whitening_filter
+from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, fit_factors, whitening_filter
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
@@ -288,9 +288,7 @@ def error_factors(
     low, high = max(low - 1, 0), high + 1
     missing = low + np.flatnonzero(np.isnan(factors[low:high, 0]))
     if len(missing):
-        some = widths[missing].tolist()
-        pairs = zip(_pulse_rows(shape, some), some, strict=True)
-        factors[missing] = [_factors_at(joint, at, *given) for joint, at in pairs]
+        factors[missing] = _factors_at(widths[missing], *given)
     widths, factors = widths[low:high], factors[low:high]
     if level_err is None:
         return interpolate(width, widths, factors[:, :4])
@@ -309,38 +307,26 @@ def _factor_table(shape: PulseShape, limits: ShapeLimits, *noise: tuple[float, .
 
 
 def _factors_at(
-    joint: np.ndarray, width: float, shape: PulseShape, limits: ShapeLimits,
+    widths: np.ndarray, shape: PulseShape, limits: ShapeLimits,
     correlation: tuple[float, ...], whitening: tuple[float, ...],
 ) -> np.ndarray:  # fmt: skip
-    """Errors of amplitude, time, width and energy over those that the fit gives, and by a wrong level (8,).
+    """Errors of amplitude, time, width and energy over those that the fit gives, and by a wrong level (m, 8).
 
-    joint: the pulse and its derivatives at this width, as `_pulse_rows` has them. The last four are of a level that is
-    wrong by the noise of a sample.
+    The last four are of a level that is wrong by the noise of a sample.
     """
-    seen = joint
-    if whitening:
-        s = joint.shape[1]
-        bare = np.zeros((s, s + 2))  # row i: what the filter makes of sample i
-        for later, tap in enumerate(whitening_filter(whitening)[2]):
-            bare.reshape(-1)[later :: s + 3][:s] = tap
-        seen = np.einsum("is,sf->if", joint, bare)
-    main = solve(np.einsum("if,jf->ij", seen, seen), seen)
-    # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
-    main = np.concatenate([main, main[:1] + main[2:]])
-    whole = main.copy()
-    whole[1] += _find_delay(shape, limits.ref, np.full(1, width))[1] * main[2]
+    by_time, by_amplitude = _find_delay(shape, limits.ref, widths)[1] + np.zeros(len(widths)), np.zeros(len(widths))
     if shape.components:
         # The peak of a pulse of amplitude 1, and its slope by the width.
         table = _rows(shape, limits.low, limits.high)
-        peak, by_peak = (np.interp(np.array(width), table[:, 0], values) for values in (table[:, 1], table[:, 2]))
-        whole[0] += by_peak / peak * width * main[2]
-    given = np.einsum("is,is->i", whole, whole)
-    weights = np.einsum("if,sf->is", whole, bare) if whitening else whole
-    variance = coloured_variance(weights, correlation)
+        peak, by_peak = (np.interp(widths, table[:, 0], table[:, column]) for column in (1, 2))
+        by_amplitude = by_peak / peak * widths
+    taps = whitening_filter(whitening)[2] if whitening else None
+    rows = zip(_pulse_rows(shape, widths.tolist()), by_amplitude, by_time, strict=True)
+    found = np.array([fit_factors(*row, taps, correlation) for row in rows])
     # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
     alone = 1.0 if whitening else max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
-    by_noise = np.sqrt(np.maximum(variance / given, LEAST_FACTOR)) / alone
-    return np.append(by_noise, weights.sum(axis=1) / np.sqrt(given))
+    found[:, :4] = np.sqrt(np.maximum(found[:, :4], LEAST_FACTOR)) / alone
+    return found
 
 
 def describe_fitted(

@@ -75,3 +75,42 @@ EXPORT int64_t coloured_variance(int64_t r, int64_t s, const double *weights, in
     }
     return 0;
 }
+
+/* What coloured noise makes of the errors of a fit of one echo, and what a wrong level does: of amplitude, time, width and energy.
+   `joint` has the pulse and its derivatives, (3, s). The whole pulse's amplitude and time change with the width by these. */
+EXPORT int64_t fit_factors(int64_t s, const double *joint, double amplitude_by_width, double time_by_width, const double *taps,
+                           int64_t k, const double *correlation, double *factors, double *by_level) {
+    const int64_t n = taps ? s + 2 : s;        /* a whitening filter reaches two samples further */
+    double *seen = calloc(7 * n + 4 * s, sizeof(double)), *whole = seen + 3 * n, *weights = whole + 4 * n;
+    double matrix[9], pivot[3], given[4];
+    if (!seen) return -1;
+    for (int i = 0; i < 3; i++)
+        for (int64_t j = 0; j < s; j++)
+            for (int later = 0; later <= n - s; later++) seen[i * n + j + later] += joint[i * s + j] * (taps ? taps[later] : 1);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) matrix[3 * i + j] = sum_products(n, seen + i * n, seen + j * n);
+    factor(3, matrix, pivot, 0);
+    for (int64_t j = 0; j < n; j++) {
+        double one[3] = {seen[j], seen[n + j], seen[2 * n + j]};
+        solve(3, matrix, pivot, one);
+        whole[3 * n + j] = one[0] + one[2];    /* of the energy: amplitude and width change by the same share */
+        whole[j] = one[0] + amplitude_by_width * one[2];
+        whole[n + j] = one[1] + time_by_width * one[2];
+        whole[2 * n + j] = one[2];
+    }
+    for (int i = 0; i < 4; i++) {
+        given[i] = sum_products(n, whole + i * n, whole + i * n);
+        by_level[i] = 0;
+        for (int64_t j = 0; j < s; j++) {
+            double weight = 0;
+            for (int later = 0; later <= n - s; later++) weight += whole[i * n + j + later] * (taps ? taps[later] : 1);
+            weights[i * s + j] = weight;
+            by_level[i] += weight;
+        }
+        by_level[i] /= sqrt(given[i]);
+    }
+    coloured_variance(4, s, weights, k, correlation, factors);
+    for (int i = 0; i < 4; i++) factors[i] /= given[i];
+    free(seen);
+    return 0;
+}

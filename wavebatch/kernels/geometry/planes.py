@@ -52,8 +52,6 @@ _TIGHT_ROUNDS = 3
 """Rounds in which sets that are not smooth use only the nearer points."""
 _ROUNDS = 8
 """Largest number of rounds."""
-_MOVED, _NEW = 2, 3
-"""States of a set, as in kernels/c/planes.h; 0: it is done."""
 
 
 class Planes(NamedTuple):
@@ -105,24 +103,22 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
     ----------
     Rousseeuw and Van Driessen (1999): trimmed least squares with concentration steps.
     """
+    start, xyz = _as_sets(xyz, group, n)
+    planes = Planes(np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.int64), np.empty(n))
+    factors = map(ctypes.c_double, (SMOOTH, TIGHT, OUTLYING * MAD_TO_STD, LEAST_SPREAD))
+    rounds = map(ctypes.c_int64, (_TIGHT_ROUNDS, _ROUNDS))
+    call("trim_planes", ctypes.c_int64(n), start, xyz, *factors, *rounds, *planes)
+    return planes
+
+
+def _as_sets(xyz: np.ndarray, group: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """First point of each set, and the end of the last one, int64 (n + 1,); points as the library reads them."""
     xyz, group = np.ascontiguousarray(xyz, np.float64), np.asarray(group)
     if len(group) != len(xyz) or (len(group) and not (0 <= group[0] <= group[-1] < n and (np.diff(group) >= 0).all())):
         raise ValueError("points lie in no set, or not in the order of their sets")
     start = np.zeros(n + 1, np.int64)
     np.cumsum(np.bincount(group, minlength=n), out=start[1:])
-    axes, spreads, centre = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
-    whole, kept, limit = np.zeros((n, 10)), np.ones(len(group), bool), np.full(n, np.inf)
-    covariance, state = np.empty((n, 3, 3)), np.full(n, _NEW, np.uint8)
-    found = axes, spreads, whole, kept, limit, centre, covariance, state
-    for number in range(1 + _ROUNDS):
-        tight = TIGHT if number <= _TIGHT_ROUNDS else 0.0
-        factors = map(ctypes.c_double, (SMOOTH, tight, OUTLYING * MAD_TO_STD, LEAST_SPREAD))
-        call("trim_planes", ctypes.c_int64(n), start, xyz, *factors, *found)
-        moved = np.flatnonzero(state == _MOVED)
-        spreads[moved], axes[moved] = np.linalg.eigh(covariance[moved])
-        if not state.any():
-            break
-    return Planes(axes, spreads, centre, np.bincount(group, kept, minlength=n).astype(np.int64), limit)
+    return start, xyz
 
 
 def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -222,7 +218,7 @@ SURE, DOUBTFUL = 0.05, 0.2
 """Chances below which a neighbourhood counts as two planes, and above which as one. With lower ones, ridges of a dozen
 points keep errors that are too small; with higher ones, the errors of single planes grow."""
 
-_SECTORS = 2 * CUTS
+_CUT_ALONG = _ACROSS[:: DIRECTIONS // CUTS]
 _SINGULAR = 1e-6
 """Points of a half whose variances differ by more than this are in line: they have no plane."""
 
@@ -258,37 +254,19 @@ def compare_halves(offset: np.ndarray, point: np.ndarray, planes: Planes) -> Hal
     An F test of the sums of squares, three parameters against six; the chance is that of the best of six cuts
     (docs/algorithms.md 1.4). A half without a plane (fewer than four points, or in line) makes its cut impossible.
     """
-    n = len(planes.kept)
-    x, y, z = offset.T
-    axes = (planes.axes[point, :, axis].T for axis in (2, 1, 0))
-    flat = [x * east + y * north + z * up for east, north, up in axes]
-    flat[2] -= np.einsum("ni,ni->n", planes.centre, planes.normal)[point]
-    near = np.abs(flat[2]) <= planes.limit[point]
-    u, v, r = (part[near] for part in flat)
-    sector = ((np.arctan2(v, u) + np.pi) * (_SECTORS / (2 * np.pi))).astype(np.int64) % _SECTORS
-    cell = point[near] * _SECTORS + sector
-    sums = np.empty((n * _SECTORS, 9))
-    sums[:, 0] = np.bincount(cell, minlength=len(sums))
-    for number, values in enumerate((u, v, r, u * u, u * v, v * v, u * r, v * r), 1):
-        sums[:, number] = np.bincount(cell, values, minlength=len(sums))
-    squares = np.bincount(point[near], r * r, minlength=n)
-    sectors = sums.reshape(n, _SECTORS, 9)
-    ring = np.concatenate([sectors, sectors[:, : CUTS - 1]], axis=1)
-    window = np.stack([ring[:, start : start + CUTS].sum(axis=1) for start in range(_SECTORS)], axis=1)
-    explained, tilts = _fit(window)
-    both = explained[:, :CUTS] + explained[:, CUTS:]
-    whole, _ = _fit(window[:, 0] + window[:, CUTS])
-    count = sectors[:, :, 0].sum(axis=1)
-    rows = np.arange(n)
-    best = np.argmax(both, axis=1)
-    known = np.isfinite(both[rows, best]) & np.isfinite(whole) & (count > 6)
-    both, whole = np.where(known, both[rows, best], 0.0), np.where(known, whole, 0.0)
+    start, xyz = _as_sets(offset, point, len(planes.kept))
+    n, found, tilts = len(planes.kept), np.empty((len(planes.kept), 4)), np.empty((len(planes.kept), 2, 2))
+    given = (np.ascontiguousarray(part, np.float64) for part in (planes.axes, planes.centre, planes.limit, _CUT_ALONG))
+    limits = ctypes.c_int64(LEAST_IN_HALF), ctypes.c_double(_SINGULAR)
+    call("compare_halves", ctypes.c_int64(n), start, xyz, *given, *limits, found, tilts)
+    count, squares, whole, both = found.T
+    known = np.isfinite(both) & np.isfinite(whole) & (count > 6)
+    both, whole = np.where(known, both, 0.0), np.where(known, whole, 0.0)
     left = np.maximum(squares - both, 0.0) + count * LEAST_SPREAD**2
     freedom = np.maximum(count - 6.0, 1.0)
     ratio = np.maximum(both - whole, 0.0) / 3.0 * freedom / np.maximum(left, LEAST_SPREAD**2)
     chance = np.where(known, np.minimum(CUTS * chance_of_ratio(ratio, freedom), 1.0), 1.0)
-    pair = np.stack([tilts[rows, best], tilts[rows, best + CUTS]], axis=1)
-    return Halves(chance, np.where(known[:, None, None], pair, 0.0))
+    return Halves(chance, np.where(known[:, None, None], tilts, 0.0))
 
 
 def chance_of_ratio(ratio: np.ndarray, freedom: np.ndarray) -> np.ndarray:
@@ -333,19 +311,6 @@ def misfit_of_angles(halves: Halves, planes: Planes, ray: np.ndarray) -> np.ndar
     with np.errstate(divide="ignore"):
         share = (np.log(DOUBTFUL) - np.log(halves.chance)) / np.log(DOUBTFUL / SURE)
     return off * np.sqrt(np.clip(share, 0.0, 1.0))
-
-
-def _fit(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a plane r = a + b u + c v explains of the squares of r, (...,), -inf without a plane; b and c (..., 2)."""
-    number, u, v, r, uu, uv, vv, ur, vr = np.moveaxis(sums, -1, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uu, uv, vv = uu - u * u / number, uv - u * v / number, vv - v * v / number
-        ur, vr = ur - u * r / number, vr - v * r / number
-        size = uu * vv - uv * uv
-        b, c = (ur * vv - vr * uv) / size, (vr * uu - ur * uv) / size
-        explained = r * r / number + b * ur + c * vr
-        known = (number >= LEAST_IN_HALF) & (size > _SINGULAR * (uu + vv) ** 2)
-    return np.where(known, explained, -np.inf), np.stack([b, c], axis=-1)
 
 
 FACET_OUTLYING = 3.5

@@ -735,6 +735,37 @@ def coloured_variance(rows: np.ndarray, correlation: tuple[float, ...] | np.ndar
     return found
 
 
+def fit_factors(
+    joint: np.ndarray, by_amplitude: float, by_time: float, taps: np.ndarray | None, correlation: tuple[float, ...]
+) -> np.ndarray:
+    """What coloured noise, and a wrong level, do to a fit of amplitude, time and width of one echo.
+
+    Parameters
+    ----------
+    joint : float64 (3, s)
+        A pulse of amplitude 1, and its derivatives by time and by width times the width.
+    by_amplitude, by_time : float
+        Change of the whole pulse's amplitude and time by the width, in these units.
+    taps : float64 (3,), optional
+        What a fit that whitens the noise takes of a sample and of those 1 and 2 before it.
+    correlation : (k,)
+        Of the noise at lags 1, 2, ... [samples].
+
+    Returns
+    -------
+    float64 (8,)
+        Variances of amplitude, time, width and energy over those that the fit gives; then what a level that is 1 too
+        high adds to each, over its standard deviation by the fit.
+    """
+    joint, rho = (np.ascontiguousarray(array, np.float64) for array in (joint, correlation))
+    if joint.shape[:1] != (3,) or (taps is not None and len(taps) != 3):
+        raise ValueError(f"a pulse of shape {joint.shape} does not have two derivatives, or taps are not three")
+    given = ctypes.c_void_p(None) if taps is None else np.ascontiguousarray(taps)
+    by_width, found = map(ctypes.c_double, (by_amplitude, by_time)), np.empty((2, 4))
+    call("fit_factors", ctypes.c_int64(joint.shape[1]), joint, *by_width, given, ctypes.c_int64(len(rho)), rho, *found)
+    return found.reshape(-1)
+
+
 def predict_noise(correlation: tuple[float, ...] | np.ndarray) -> tuple[float, float] | None:
     """Find what predicts the noise of a sample from the two before it.
 
