@@ -30,10 +30,11 @@ from wavebatch.kernels.fit.decompose import (
     Settings,
     cluster_candidates,
     decompose_clusters,
+    explain_tails,
     promise_echoes,
 )
 from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
-from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
+from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable, PulseTail
 from wavebatch.kernels.geometry.planes import Planes, compare_halves
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_correlated, find_maxima, quiet_levels
@@ -204,6 +205,10 @@ def look_for(samples: Samples, candidates: Candidates, rng: np.random.Generator)
     margin, reach, most = int(rng.integers(0, 99)), int(rng.integers(0, 99)), int(rng.integers(1, 9))
     clusters = cluster_candidates(samples, ordered, margin=margin, reach=reach, most=most, tail=tail)
     assert clusters.number.sum() == len(order)
+    size = int(rng.integers(0, 9))
+    highest = np.sort(rng.random(size + 1))[::-1].copy()
+    shape = PulseTail(float(rng.normal(0, s)), rng.normal(0, 1, 2 * size + 1), highest)
+    assert (explain_tails(ordered, samples.std, shape, most, 1.0)[1] <= size + 1).all()
     judge(samples, ordered, rng)
 
 

@@ -3,8 +3,10 @@
 import naive
 import numpy as np
 import pytest
+from commands import refuses
 
-from wavebatch.kernels.fit.decompose import Candidates, cluster_candidates
+from wavebatch.kernels.fit.decompose import Candidates, cluster_candidates, explain_tails
+from wavebatch.kernels.fit.pulse_shape import TAIL_STEP, PulseShape, pulse_tail
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_correlated, find_maxima, gaussian_taps, quiet_levels
 
@@ -171,3 +173,29 @@ def test_clusters(rng, most, tails):
     tail = rng.integers(0, 9, len(time)) if tails else None
     found = cluster_candidates(samples, candidates, margin=2, reach=5, most=most, tail=tail)
     np.testing.assert_array_equal(np.stack(found, axis=1), naive_clusters(samples, candidates, 2, 5, most, tail))
+
+
+def naive_tails(candidates, std, tail, most, quiet):
+    """Candidates as (kept, reach): tails of all others added up, and looked through from their far ends."""
+    lags, found = tail.first + TAIL_STEP * np.arange(len(tail.value)), []
+    for i, (row, time, amplitude) in enumerate(zip(*candidates[:3], strict=True)):
+        near = [k for k in np.flatnonzero(candidates.waveform == row) if 0 < abs(k - i) <= most]
+        places = [np.flatnonzero(np.abs(lags - (time - candidates.time[k])) <= TAIL_STEP / 2) for k in near]
+        expected = sum(candidates.amplitude[k] * tail.value[at].sum() for k, at in zip(near, places, strict=True))
+        beyond = 2.2 * std[row] + 0.5 * expected < amplitude - expected
+        seen = lags[np.abs(tail.value) * amplitude > std[row]]
+        found.append((beyond or expected <= quiet * std[row], np.ceil(max([0, *(seen[seen >= 0] + TAIL_STEP)]))))
+    return np.array(found)
+
+
+def test_tails(rng):
+    tail = pulse_tail(PulseShape(components=((0.1, 12.0, 0.5), (0.03, 20.0, 2.0), (-0.01, -9.0, 0.0))), 1.7)
+    waveform = np.sort(rng.integers(0, 60, 400))
+    time = rng.uniform(0, 70, 400)
+    time = time[np.lexsort((time, waveform))]
+    candidates = Candidates(waveform, time, 10 ** rng.uniform(0, 3, 400), np.ones(400))
+    std = rng.uniform(0.5, 2, 60).astype(np.float32)
+    found = explain_tails(candidates, std, tail, 2, 0.5)
+    np.testing.assert_array_equal(np.stack(found, axis=1), naive_tails(candidates, std, tail, 2, 0.5))
+    assert 40 < found[0].sum() < 360 and len(np.unique(found[1])) > 5
+    refuses(ValueError, "no waveform", explain_tails, candidates, std[:9], tail, 2, 0.5)

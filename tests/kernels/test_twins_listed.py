@@ -36,6 +36,7 @@ COMPILED = {
     "find_two_lines": ("in_two_lines", "test_hough.on_two_lines"),
     "trim_planes": ("fit_planes", "test_planes.naive_plane"),
     "coloured_variance": ("colour_factors", "naive_signal.colour_factors"),
+    "explain_tails": ("explain_tails", "test_maxima.naive_tails"),
     "compare_halves": ("compare_halves", "naive.compare_halves"),
     "fit_factors": ("fit_factors", "naive_signal.fit_factors"),
     "find_around": ("Surroundings", "test_planes._neighbours_by_loop"),

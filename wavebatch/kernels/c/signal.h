@@ -311,3 +311,43 @@ EXPORT int64_t group_candidates(const Block *b, int64_t m, const int64_t *wavefo
     free(at); free(low); free(high);
     return good ? number : -1;
 }
+
+static const float FAR_ABOVE = 2.2f;           /* noises, and half of the tails, that a candidate lies above them where it is another echo */
+
+typedef struct { /* what an echo of amplitude 1 leaves at n lags, from `first` on, `step` apart [samples] */
+    int64_t n, after;                          /* lags; the one of 0 */
+    double first, step;
+    const double *value, *highest;             /* from each lag after 0 on: the largest size, (n - after) */
+} Tail;
+
+static double tail_at(const Tail *t, double lag) {
+    const double place = rint((lag - t->first) / t->step);
+    return place >= 0 && place < t->n ? t->value[(int64_t)place] : 0;
+}
+
+/* Which of m candidates, sorted by waveform and time, are more than tails of up to `most` others on each side, or than `quiet`
+   noises; and how far the tail of each exceeds the noise [samples]. */
+EXPORT int64_t explain_tails(int64_t m, const int64_t *waveform, const double *time, const double *amplitude, const float *std,
+                             const Tail *t, int64_t most, float quiet, uint8_t *kept, int64_t *reach) {
+    for (int64_t i = 0; i < m; i++) {
+        const float noise = std[waveform[i]];
+        double expected = 0;
+        for (int64_t step = 1; step <= most; step++) {
+            const int64_t earlier = i - step, later = i + step;
+            const int before = earlier >= 0 && waveform[earlier] == waveform[i], behind = later < m && waveform[later] == waveform[i];
+            if (before) expected += amplitude[earlier] * tail_at(t, time[i] - time[earlier]);
+            if (behind) expected += amplitude[later] * tail_at(t, time[i] - time[later]);
+            if (!before && !behind) break;
+        }
+        kept[i] = amplitude[i] - expected > FAR_ABOVE * noise + 0.5 * expected || expected <= quiet * noise;
+        const double least = 1 / fmax(amplitude[i] / noise, 1e-9);
+        int64_t low = 0, high = t->n - t->after; /* the first lag from which the tail is in the noise */
+        while (low < high) {
+            const int64_t middle = (low + high) / 2;
+            if (t->highest[middle] <= least) high = middle;
+            else low = middle + 1;
+        }
+        reach[i] = (int64_t)ceil(low * t->step);
+    }
+    return 0;
+}

@@ -17,7 +17,7 @@ import numpy as np
 
 from wavebatch.kernels import library
 from wavebatch.kernels.fit.neighbours import COLUMNS
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseShape
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, TAIL_STEP, PulseShape, PulseTail
 from wavebatch.kernels.library import Samples, call, place
 
 
@@ -91,6 +91,43 @@ def cluster_candidates(
     groups = library.CGroups(*(place(column, np.int64) for column in columns))
     c = call("group_candidates", samples.as_block(), ctypes.c_int64(m), waveform, time, grouping, groups)
     return Clusters(*(column[:c] for column in columns))
+
+
+def explain_tails(
+    candidates: Candidates, std: np.ndarray, tail: PulseTail, most: int, quiet: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which candidates are more than after-pulses of others of their waveform.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        m, sorted by waveform, then time.
+    std : float32 (n,)
+        Noise of each waveform [count].
+    tail : PulseTail
+        Of the system pulse.
+    most : int
+        Candidates on each side whose tails count.
+    quiet : float
+        Tails below so many noises explain nothing.
+
+    Returns
+    -------
+    kept : bool (m,)
+    reach : int64 (m,), samples
+        How far the tail of each exceeds the noise.
+    """
+    m, std = len(candidates.waveform), np.ascontiguousarray(std, np.float32)
+    waveform = np.ascontiguousarray(candidates.waveform, np.int64)
+    time, amplitude = (np.ascontiguousarray(values, np.float64) for values in (candidates.time, candidates.amplitude))
+    if not len(time) == len(amplitude) == m or (m and not 0 <= waveform.min() <= waveform.max() < len(std)):
+        raise ValueError("a candidate lies in no waveform")
+    kept, reach, n = np.empty(m, np.bool_), np.empty(m, np.int64), len(tail.value)
+    value, highest = (place(values, np.float64) for values in (tail.value, tail.highest))
+    given = library.CTail(n, n - len(tail.highest), tail.first, TAIL_STEP, value, highest)
+    limits = ctypes.c_int64(most), ctypes.c_float(quiet)
+    call("explain_tails", ctypes.c_int64(m), waveform, time, amplitude, std, given, *limits, kept, reach)
+    return kept, reach
 
 
 class Settings(NamedTuple):

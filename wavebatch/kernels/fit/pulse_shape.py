@@ -157,6 +157,8 @@ class PulseTail(NamedTuple):
     """Lag of the first value [samples]."""
     value: np.ndarray
     """The tail, float64 (r,)."""
+    highest: np.ndarray
+    """From each lag after 0 on, the largest size that follows, float64."""
 
 
 TAIL_STEP = 0.25
@@ -185,34 +187,8 @@ def pulse_tail(shape: PulseShape, width: float) -> PulseTail:
     time, wide = np.zeros(1), np.full(1, width)
     whole = evaluate_pulse(shape, lag[:, None], time, wide)[0][:, 0]
     value = np.where(np.abs(lag) > CORE * width, whole - exp(-0.5 * (lag / width) ** 2), 0.0)
-    return PulseTail(float(lag[0]), value)
-
-
-def tail_at(tail: PulseTail, lag: np.ndarray) -> np.ndarray:
-    """The tail at given lags [samples], of their shape; 0 beyond its ends."""
-    place = np.rint((lag - tail.first) / TAIL_STEP).astype(np.int64)
-    inside = (place >= 0) & (place < len(tail.value))
-    return np.where(inside, tail.value[np.clip(place, 0, len(tail.value) - 1)], 0.0)
-
-
-def tail_reach(tail: PulseTail, ratio: np.ndarray) -> np.ndarray:
-    """How far the tail of an echo exceeds the noise.
-
-    Parameters
-    ----------
-    tail : PulseTail
-        Tail of the system pulse.
-    ratio : float (m,)
-        Amplitude over noise of each echo.
-
-    Returns
-    -------
-    int64 (m,), samples
-    """
-    after = np.abs(tail.value[int(round(-tail.first / TAIL_STEP)) :])
-    highest = np.maximum.accumulate(after[::-1])[::-1]
-    number = len(highest) - np.searchsorted(highest[::-1], 1.0 / np.maximum(ratio, 1e-9), side="right")
-    return np.ceil(number * TAIL_STEP).astype(np.int64)
+    highest = np.maximum.accumulate(np.abs(value[len(lag) // 2 :])[::-1])[::-1]
+    return PulseTail(float(lag[0]), value, np.ascontiguousarray(highest))
 
 
 class PulseMeasures(NamedTuple):

@@ -17,7 +17,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit import decompose
 from wavebatch.kernels.fit.neighbours import finish_echoes
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, matched_gaussian, pulse_tail, tail_at, tail_reach
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, matched_gaussian, pulse_tail
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Range
@@ -137,22 +137,10 @@ def _explain_tails(
     if not settings.shape.components:
         return candidates, None
     tail = pulse_tail(settings.shape, settings.width_ref)
-    waveform, time, amplitude, _ = candidates
-    expected = np.zeros(len(waveform))
-    for step in range(1, min(MOST_JOINED, len(waveform))):
-        first = np.flatnonzero(waveform[step:] == waveform[:-step])
-        if not len(first):
-            break
-        later = first + step
-        lag = time[later] - time[first]
-        expected[later] += amplitude[first] * tail_at(tail, lag)
-        expected[first] += amplitude[later] * tail_at(tail, -lag)
-    std = noise.std[waveform]
-    keep = amplitude - expected > 2.2 * std + 0.5 * expected
     # A tail below the noise of what found a candidate does not explain it, however broad the pulse is.
-    keep |= expected <= choose_smoothing(ref)[2] * std
-    candidates = decompose.Candidates(*(field[keep] for field in candidates))
-    return candidates, tail_reach(tail, candidates.amplitude / std[keep])
+    quiet = choose_smoothing(ref)[2]
+    keep, reach = decompose.explain_tails(candidates, noise.std, tail, MOST_JOINED - 1, quiet)
+    return decompose.Candidates(*(field[keep] for field in candidates)), reach[keep]
 
 
 @frozen
