@@ -1,6 +1,8 @@
 """Forest metrics of cells from voxels, against forests of discs whose leaf area is known."""
 
 import json
+import re
+from dataclasses import replace
 
 import laspy
 import numpy as np
@@ -12,6 +14,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
+from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey
 from wavebatch.tools.raster import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
@@ -75,6 +78,26 @@ def test_light_that_noise_hides_is_in_the_errors(tmp_path, ratio):
     for name, right in (("leaf_area_index", true), ("cover", 1 - np.exp(-0.5 * true))):
         off = np.abs(found[name] - right) / found[f"{name}_err"]
         assert 0.3 < np.median(off) < 1.9, name
+
+
+@pytest.mark.parametrize(("slope", "height", "divergence", "named"), [
+    (0.84, 0.5, None, True), (0.84, 0.9, None, False), (0.4, 0.5, None, False), (0.84, 0.5, 1.0, True),
+    (0.84, 0.5, 0.3, False),
+])  # fmt: skip
+def test_ground_that_slopes_within_footprints_is_named(tmp_path, slope, height, divergence, named):
+    """On 40 degrees, ground in footprints of 1 m was .07 of the cover, with an error of .01, and a third of leaves."""
+    rng = np.random.default_rng(4)
+    fly(tmp_path / "s.las", rng, grow(rng, 8.0, crowns=None, density=0.2, slope=slope), 8.0, pulses=2.0, footprint=1.0)
+    survey = replace(SAVED.survey, system=SAVED.survey.system.with_radiometry(divergence=divergence))
+    sensor = SensorRequest(height=1000.0)
+    options = VoxelOptions(1.0, forest=True, ground_height=height)
+    saved = replace(SAVED, survey=survey)
+    summary = voxelize_strip(tmp_path / "s.las", tmp_path / "v.laz", options, system=saved, sensor=sensor, force=True)
+    lines = [line for line in summary.warnings if "ground in footprints of 1 m" in line]
+    assert len(lines) == named
+    if named:
+        assert re.match("on slopes of 4[01] degrees", lines[0]) and lines[0].endswith("give --ground-height 0.9")
+        assert ("assumed" in lines[0]) == (divergence is None)
 
 
 @pytest.mark.slow

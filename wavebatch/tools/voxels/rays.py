@@ -32,6 +32,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import quantile
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
@@ -275,6 +276,8 @@ class Floor(CellMap):
     def __init__(self, middle: np.ndarray, most: int = MOST_CELLS) -> None:
         super().__init__(middle, CELL, highest=False, most=most)
         self._slope = np.empty((0, 2))
+        self.steep = 0.0
+        """Rise per metre that 84 % of the planes do not exceed."""
 
     def finish(self) -> Floor:
         """Fits the planes; returns the map."""
@@ -287,6 +290,8 @@ class Floor(CellMap):
         usable &= planes.spreads[:, 1] > (LEAST_WIDTH * self.cell) ** 2
         up = np.where(usable, normal[:, 2], 1.0)[:, None]
         self._slope = np.where(usable[:, None], -normal[:, :2] / up, 0.0)
+        if usable.any():
+            self.steep = quantile(np.hypot(*self._slope[usable].T), 0.84)
         # The plane, not the lowest return itself: that may lie below the ground.
         base = planes.centre[:, 2] - (self._slope * planes.centre[:, :2]).sum(axis=1)
         self._kept[:, 2] += np.where(usable, base, 0.0)

@@ -50,6 +50,9 @@ LARGEST = 1e6
 SAMPLED = 4096
 """Pulses from which the reflectance ratio is estimated."""
 
+WIDE = 1.0
+"""Of footprints whose beam is not known [m]: most are smaller."""
+
 _SAMPLED_UNITS = 16
 """Units that they are read from."""
 
@@ -237,6 +240,16 @@ def voxelize_strip(
         tracer = _Tracer(
             reader, source, pulse, options, floor.finish(), ceiling.finish(), energy, calibration is not None
         )
+        wide = 1e-3 * (pulse.radiometry.divergence or 0.0) * (source.distance or 0.0)
+        assumed, wide = "" if wide else " (assumed, as beam or range are not known)", wide or WIDE
+        # Half of it rises to the edge of a footprint; the planes are not known better than to the other half.
+        if options.forest and wide * floor.steep > options.ground_height:
+            doubts += (
+                f"on slopes of {math.degrees(math.atan(floor.steep)):.0f} degrees, ground in footprints of {wide:.2g} "
+                f"m{assumed} reaches above --ground-height {options.ground_height:g} and counts as plants, so that "
+                "cover and leaf area are too large: give --ground-height "
+                f"{options.ground_height + 0.5 * wide * floor.steep:.1f}",
+            )
         numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
         each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
         batches = rays.read_batches(
