@@ -115,6 +115,12 @@ def write_points(
     return cloud
 
 
+def number_returns(count: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pulse, return number and number of returns of each return; count: returns of each pulse."""
+    pulse = np.repeat(np.arange(len(count)), count)
+    return pulse, np.arange(len(pulse)) - np.repeat(np.cumsum(count) - count, count) + 1, count[pulse]
+
+
 def facts_of(path: Path) -> StripFacts:
     """What the reader finds about a strip."""
     with StripReader(path) as reader:

@@ -364,6 +364,7 @@ def test_text_table_and_page_have_the_classes_and_the_numbers_of_echoes(strips, 
     document = json.loads(result.stdout)
     text = compare_files(strips / "a.las", strips / "b.las").stdout
     shown = Page(tmp_path / "p.html").check()
+    assert "does not add up" not in (tmp_path / "p.html").read_text()
     with (tmp_path / "t.csv").open(newline="") as file:
         rows = {tuple(row.values())[:5]: row["value"] for row in csv.DictReader(file)}
     assert "A - B by class " in text and "A - B by echoes" in text

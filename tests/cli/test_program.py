@@ -167,7 +167,10 @@ def test_manual_pages_have_the_text_of_help(tmp_path):
     assert result.exit_code == 0 and result.stdout == ""
     pages = {path.name: path.read_text() for path in (tmp_path / "man").iterdir()}
     assert len(pages) == 1 + sum(1 for _ in _commands()) and "wavebatch-plot-map.1" in pages
-    assert ".SH EXAMPLES" in pages["wavebatch-run.1"] and roff("--tolerance LENGTH") in pages["wavebatch-run.1"]
+    text = pages["wavebatch-run.1"]
+    assert ".SH EXAMPLES" in text and roff("--tolerance LENGTH") in text and "\n\\&" not in text
+    assert "\n.PP\nDecompose strips into enriched point clouds.\n" in text
+    assert ".SH SEE ALSO" in text and ".SH SEE ALSO" not in pages["wavebatch.1"]
     assert not any(re.search(r"(?m)^'", text) for text in pages.values())
     if shutil.which("groff"):
         for path in (tmp_path / "man").iterdir():

@@ -369,11 +369,14 @@ def test_few_outgoing_pulses_have_an_energy_but_no_width(tmp_path, rng):
     assert done.exit_code == 0 and "nan" not in done.output and "1 points" not in done.output, done.output
 
 
-def test_a_crs_that_stays_in_geotiff_keys_is_named(tmp_path, rng):
-    keys = struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 31467)  # Gauss-Krueger, no UTM zone
+@pytest.mark.parametrize(("code", "stays"), [(31467, True), (32633, False)])
+def test_a_crs_that_stays_in_geotiff_keys_is_named(tmp_path, rng, code, stays):
+    """Gauss-Krueger is no UTM zone."""
+    keys = struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, code)
     path = _make(tmp_path, list(_flight(rng, number=3)), appended=[("PulseWaves_Proj", 34735, keys)])
     notes = import_file(path, tmp_path / "o.las", ImportOptions()).notes
-    assert any("the CRS stays as GeoTIFF keys" in note for note in notes)
+    assert any("the CRS stays as GeoTIFF keys" in note for note in notes) is stays
+    assert stays or f'"{code}"' in _points(tmp_path / "o.las")[0].crs
 
 
 def _list_rows(path):

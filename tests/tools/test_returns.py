@@ -10,15 +10,13 @@ import pytest
 from batch_tools import read_cloud, run_one
 from click.testing import CliRunner
 from commands import refuses, succeed
-from writer_tools import write_points
+from writer_tools import number_returns, write_points
 
 from wavebatch.cli.clouds import SHOWN, stats
 from wavebatch.cli.strips import synthesize
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.geojson import Polygon
-from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype
-from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.pairing import compare_clouds
@@ -28,20 +26,13 @@ from wavebatch.tools.simulate.returns import Radar, SynthesisOptions, synthesize
 
 
 def write_cloud(path, time, z, number, total, *, flags=None, point_format=1):
-    """A LAS file of points above each other, 1 mm units."""
-    records = [] if flags is None else [ExtraRecord.build("echo_flags", "u2", "bits")]
-    dtype = build_dtype(point_format, records)
-    rows = np.zeros(len(z), dtype)
-    rows["Z"] = np.rint(np.multiply(z, 1000))
-    rows["bit_fields"] = np.asarray(number) | np.asarray(total) << 3
-    if "gps_time" in dtype.names:
-        rows["gps_time"] = time
-    if flags is not None:
-        rows["echo_flags"] = flags
-    header = LasHeader((1, 2), point_format, 0, (0.001,) * 3, (0.0,) * 3)
-    file = PointFile(path, header, dtype, records, overwrite=True)
-    file.write(rows)
-    file.commit()
+    """Points above each other, 1 mm units."""
+    fields = {"return_number": number, "number_of_returns": total}
+    fields |= {} if point_format == 0 else {"gps_time": time}
+    fields |= {} if flags is None else {"echo_flags": flags}
+    extra = [] if flags is None else [("echo_flags", "u2")]
+    xyz = np.stack([np.zeros(len(z)), np.zeros(len(z)), z], axis=1)
+    write_points(path, xyz, point_format=point_format, extra=extra, **fields)
     return path
 
 
@@ -63,17 +54,14 @@ def check_small(found, by):
     assert math.isnan(found.dead_zone)
 
 
-def test_small_cloud_is_counted(tmp_path):
-    each, total = count_returns([write_cloud(tmp_path / "c.las", **SMALL)])
-    check_small(each[0], "gps_time")
-    check_small(total, "gps_time")
+@pytest.mark.parametrize(("point_format", "by"), [(1, "gps_time"), (0, "return_number")])
+def test_small_cloud_is_counted_by_times_or_rising_numbers(tmp_path, point_format, by):
+    path = write_cloud(tmp_path / "c.las", **SMALL, point_format=point_format)
+    for held in (400_000, 2):
+        each, total = count_returns([path], held=held)
+        check_small(each[0], by)
+        check_small(total, by)
     assert each[0].flags is None
-
-
-def test_without_times_rising_numbers_make_a_pulse(tmp_path):
-    path = write_cloud(tmp_path / "c.las", **SMALL, point_format=0)
-    check_small(count_returns([path])[1], "return_number")
-    check_small(count_returns([path], held=2)[1], "return_number")
 
 
 @pytest.mark.parametrize("missing", [np.nan, 0.0])
@@ -91,10 +79,8 @@ def test_points_without_a_time_are_not_one_pulse(tmp_path, missing):
 
 @pytest.mark.parametrize(("deep", "limited"), [(1, False), (40, True)])
 def test_a_few_deep_pulses_are_no_limit_of_the_sensor(tmp_path, deep, limited):
-    count = np.r_[np.ones(50, int), np.full(deep, 4)]
-    number = np.concatenate([np.arange(1, n + 1) for n in count])
-    total, time = np.repeat(count, count), np.repeat(1.0 + np.arange(len(count)), count)
-    found = count_returns([write_cloud(tmp_path / "c.las", time, -2.0 * number, number, total)])[1]
+    pulse, number, total = number_returns(np.r_[np.ones(50, int), np.full(deep, 4)])
+    found = count_returns([write_cloud(tmp_path / "c.las", 1.0 + pulse, -2.0 * number, number, total)])[1]
     assert any(line.startswith("limit") for line in found.warnings) == limited
 
 
@@ -132,9 +118,7 @@ def test_counted_pulses_whose_points_are_missing_are_not_stored_twice(tmp_path):
 
 @pytest.mark.parametrize(("points", "said"), [(3, "crowded: 5 of 1000 pulses"), (1, "incomplete: 5 of 1000 pulses")])
 def test_half_a_percent_of_wrong_pulses_is_named(tmp_path, points, said):
-    count = np.where(np.arange(1000) % 200, 2, points)
-    pulse = np.repeat(np.arange(1000), count)
-    number = np.arange(len(pulse)) - np.repeat(np.cumsum(count) - count, count) + 1
+    pulse, number, _ = number_returns(np.where(np.arange(1000) % 200, 2, points))
     path = write_cloud(tmp_path / "c.las", 1.0 + pulse, -2.0 * number, number, np.full(len(pulse), 2))
     assert any(line.startswith(said) for line in count_returns([path])[1].warnings)
 
@@ -235,47 +219,49 @@ def test_hidden_pairs_are_those_that_as_many_as_just_above_the_zone_would_be(tmp
 def make_cloud(path, n=800, seed=0, east=300_000.0):
     """Slanted pulses with 1 to 4 returns over 100 m x 60 m, shuffled: the pulse of every point, x y z, numbers."""
     rng = np.random.default_rng(seed)
-    count = rng.integers(1, 5, n)
-    pulse = np.repeat(np.arange(n), count)
-    number = np.arange(len(pulse)) - np.repeat(np.cumsum(count) - count, count) + 1
+    pulse, number, total = number_returns(rng.integers(1, 5, n))
     start = np.stack([rng.uniform(0, 100, n), rng.uniform(-30, 30, n), np.full(n, 50.0)], axis=1)
     step = np.stack([rng.uniform(-3, 3, n), rng.uniform(-3, 3, n), rng.uniform(-8, -1, n)], axis=1)
     xyz = np.round(start[pulse] + number[:, None] * step[pulse] + [east, 0, 0], 3)
     order = rng.permutation(len(pulse))
-    pulse, xyz, number, total = pulse[order], xyz[order], number[order], count[pulse[order]]
+    pulse, xyz, number, total = pulse[order], xyz[order], number[order], total[order]
     fields = {"gps_time": 1e5 + pulse, "return_number": number, "number_of_returns": total}
     write_points(path, xyz, offsets=(east, 0, 0), **fields)
     return pulse, xyz, number
 
 
 def count_naively(pulse, xyz, number, area_of):
-    """Per area: points, pulses, points by number, pulses by count, separations."""
+    """Per area: points, pulses, points by number, pulses by count, separations, also by rank, and depths."""
     found = {}
     for one in np.unique(pulse):
         rows = np.flatnonzero(pulse == one)
         rows = rows[np.argsort(number[rows])]
-        area = found.setdefault(area_of(*xyz[rows[0], :2]), [0, 0, {}, {}, []])
+        area = found.setdefault(area_of(*xyz[rows[0], :2]), [0, 0, {}, {}, [], {}, []])
         area[0] += len(rows)
         area[1] += 1
         area[3][len(rows)] = area[3].get(len(rows), 0) + 1
         for row in rows:
             area[2][number[row]] = area[2].get(number[row], 0) + 1
-        area[4] += [math.dist(xyz[a], xyz[b]) for a, b in zip(rows[:-1], rows[1:], strict=True)]
+        for rank, (a, b) in enumerate(zip(rows[:-1], rows[1:], strict=True), 1):
+            area[4].append(math.dist(xyz[a], xyz[b]))
+            area[5].setdefault(f"{rank}-{rank + 1}", []).append(area[4][-1])
+        area[6] += [xyz[rows[0], 2] - xyz[rows[-1], 2]] if len(rows) > 1 else []
     return found
 
 
 def check_areas(found, naive, key):
     assert {key(area) for area in found} == set(naive) and len(found) == len(naive)
     for area in found:
-        points, pulses, by_number, by_count, apart = naive[key(area)]
+        points, pulses, by_number, by_count, apart, ranks, depths = naive[key(area)]
         assert (area.points, area.pulses, area.pairs) == (points, pulses, len(apart))
         assert area.returns_per_pulse == points / pulses
         assert area.by_number == pytest.approx({k: n / points for k, n in by_number.items()})
         assert area.by_count == pytest.approx({k: n / pulses for k, n in by_count.items()})
-        if apart:
-            assert area.mean == pytest.approx(np.mean(apart)) and area.least == pytest.approx(min(apart))
-        else:
-            assert math.isnan(area.mean) and math.isnan(area.least)
+        assert list(area.separations) == sorted(ranks) and area.several == len(depths)
+        for one, each in ((area, apart), *((area.separations[name], ranks[name]) for name in ranks)):
+            mean, least = (np.mean(each), min(each)) if each else (math.nan, math.nan)
+            assert (one.pairs, one.mean, one.least) == pytest.approx((len(each), mean, least), nan_ok=True)
+        assert area.depth == pytest.approx(np.mean(depths) if depths else math.nan, nan_ok=True)
 
 
 def check_sum(areas, total):
@@ -288,6 +274,9 @@ def check_sum(areas, total):
             number = sum(getattr(area, kind).get(k, 0) * getattr(area, whole) for area in areas)
             assert number == pytest.approx(share * getattr(total, whole))
     assert min(area.least for area in areas if area.pairs) == total.separations["all"].least
+    assert sum(area.several for area in areas) == total.several
+    depths = [area.depth * area.several for area in areas if area.several]
+    assert sum(depths) == pytest.approx(total.depth * total.several)
 
 
 @pytest.mark.parametrize("size", [7.5, 40.0, 1000.0])
@@ -298,6 +287,7 @@ def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, size, held):
     naive = count_naively(*points, lambda x, y: (math.floor(x / size) * size, math.floor(y / size) * size))
     check_areas(one.areas, naive, lambda area: (area.x, area.y))
     check_sum(one.areas, one)
+    check_sum(one.areas, total)
     assert all(area.kind == "cell" for area in one.areas)
     places = [(area.x, area.y) for area in one.areas]
     assert places == sorted(places) == [(area.x, area.y) for area in total.areas]
@@ -366,32 +356,6 @@ def write_features(path, *features):
 
 def feature(kind, coordinates, **properties):
     return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
-
-
-def test_separations_by_rank_and_depth_of_pulses(tmp_path):
-    pulse, xyz, number = make_cloud(tmp_path / "c.las")
-    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(25.0)])
-    cells, depths = {}, {}
-    for each in np.unique(pulse):
-        rows = np.flatnonzero(pulse == each)
-        rows = rows[np.argsort(number[rows])]
-        place = tuple(np.floor(xyz[rows[0], :2] / 25) * 25)
-        for rank, (a, b) in enumerate(zip(rows[:-1], rows[1:], strict=True), 1):
-            cells.setdefault((*place, f"{rank}-{rank + 1}"), []).append(math.dist(xyz[a], xyz[b]))
-        if len(rows) > 1:
-            depths.setdefault(place, []).append(xyz[rows[0], 2] - xyz[rows[-1], 2])
-    assert sum(len(area.separations) for area in one.areas) == len(cells)
-    for area in one.areas:
-        for name, found in area.separations.items():
-            apart = cells[area.x, area.y, name]
-            assert found.pairs == len(apart) and found.least == pytest.approx(min(apart))
-            assert found.mean == pytest.approx(np.mean(apart))
-        depth = depths.get((area.x, area.y), [])
-        assert area.several == len(depth)
-        assert area.depth == pytest.approx(np.mean(depth) if depth else math.nan, nan_ok=True)
-    every = np.concatenate(list(depths.values()))
-    for stats_of in (one, total):
-        assert stats_of.several == len(every) and stats_of.depth == pytest.approx(every.mean())
 
 
 def test_table_text_and_json_say_the_same(tmp_path):
