@@ -372,25 +372,6 @@ def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target):
     assert len(made) == 1
 
 
-def test_two_halves_of_a_strip_add_up_to_the_whole(tmp_path):
-    rng = np.random.default_rng(3)
-    echoes = [[(rng.uniform(98, 106), rng.uniform(20, 80))] for _ in range(120)]
-    xy = rng.uniform(0, 4, (120, 2))
-    parts = [slice(0, 120), slice(0, 50), slice(50, 120)]
-    tables = []
-    for number, part in enumerate(parts):
-        strip = write_strip(tmp_path / f"{number}.las", echoes[part], xy=xy[part], noise=0.0, returns=False)
-        _, found = voxelize(strip, tmp_path / f"{number}.npz", 0.5, all_crossed=True)
-        cells = np.rint(found["origin"] / 0.5) + found["index"]
-        values = zip(found["energy"].astype(float), found["rays"].astype(float), strict=True)
-        tables.append(dict(zip(map(tuple, cells.tolist()), values, strict=True)))
-    whole, first, second = tables
-    assert set(whole) == set(first) | set(second)
-    for cell, (energy, count) in whole.items():
-        a, b = first.get(cell, (0, 0)), second.get(cell, (0, 0))
-        assert count == a[1] + b[1] and energy == pytest.approx(a[0] + b[0], rel=1e-6, abs=1e-5)
-
-
 @pytest.mark.parametrize(("point_format", "output"), [(4, 0), (5, 0), (9, 6), (10, 6)])
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_a_point_cloud_holds_what_the_npz_holds(tmp_path, point_format, output, suffix):
