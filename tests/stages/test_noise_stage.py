@@ -47,6 +47,24 @@ def test_baselines_are_those_of_a_loop(rng, recovery, gaps):
 
 
 @pytest.mark.parametrize("gaps", [False, True])
+def test_a_level_far_from_the_strips_is_seen_where_a_waveform_is_flat(rng, gaps):
+    """One waveform 4 DN above levels that scatter by .5: no sample of it is quiet by the strip's. One full of echoes is
+    not flat, and keeps the strip's level."""
+    x = np.arange(200.0)
+    samples = 12 + 1.1 * rng.standard_normal((50, 200))
+    samples[7] += 4
+    samples[8] += 30 + 20 * np.sin(x / 4)
+    missing = np.zeros(samples.shape, bool)
+    missing[:, 150:] = gaps
+    block = WaveformBlock.from_samples(np.rint(samples).astype(np.uint8))
+    block = replace(block, missing=missing) if gaps else block
+    baseline = STAGES["noise.pooled"].function(block, SYSTEM).baseline
+    assert baseline[7] == pytest.approx(16, abs=0.3)
+    assert baseline[8] == 12
+    assert np.delete(baseline, [7, 8]) == pytest.approx(np.full(48, 12), abs=0.5)
+
+
+@pytest.mark.parametrize("gaps", [False, True])
 def test_levels_of_the_last_samples_scatter_by_their_errors(rng, gaps):
     samples = np.rint(20 + 1.5 * rng.standard_normal((4000, 60))).astype(np.uint8)
     missing = np.zeros(samples.shape, bool)

@@ -101,6 +101,23 @@ def test_a_layer_below_every_echo_is_no_tail(is_tail):
     assert dict(tail).get(5 * width, 0.0) == (pytest.approx(0.05, rel=0.1) if is_tail else 0.0)
 
 
+def test_a_ringing_whose_flanks_lie_between_steps_is_a_tail():
+    """.5 % up and down again, 12 widths after echoes of 700 noises, at lags that scatter by .3 widths: slopes are no
+    scatter."""
+    rng = np.random.default_rng(6)
+    n, width, x = 600, 5.0, np.arange(160.0)
+    height, time = np.exp(rng.uniform(np.log(300), np.log(1400), n)), rng.uniform(40, 60, n)
+    after = time + width * (11.7 + 0.3 * rng.standard_normal(n))
+    parts = (height, time, width), (0.005 * height, after, 3.0), (-0.005 * height, after + 1.7 * width, 3.0)
+    signal = sum(one[:, None] * np.exp(-0.5 * ((x - at[:, None]) / size) ** 2) for one, at, size in parts)
+    samples = np.rint(12 + signal + rng.standard_normal((n, 160))).astype(np.uint16)
+    block = WaveformBlock.from_samples(samples)
+    system = SystemPulse(sigma_ref=width, noise=ReceiverNoise(baseline=12.0, std=1.0))
+    tail = dict(measure_tail(block, system, find_clear(block, system)).tail_misfit)
+    assert {11 * width, 12 * width, 14 * width} <= tail.keys()
+    assert all(9 * width < lag < 17 * width and share < 0.006 for lag, share in tail.items())
+
+
 PART, NO_PART = ["part", "hidden", "weak", "at the edge"], ["canopy", "half of them", "layer", "four", "object"]
 
 

@@ -65,23 +65,31 @@ def pooled(
     reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
     recovery = int(np.ceil(min(system.noise.recovery / block.spacing, block.samples.shape[1])))
     spread, quiet = system.noise.baseline_spread, max(system.noise.quiet, QUANTISATION_STD)
-    if spread > DRIFT * std:
-        signal = transpose_samples(block.samples)
-        signal -= np.float32(system.noise.baseline)
-        mean, used, number = find_levels(signal, std, reach, limit, recovery)
-        if block.missing is not None:
-            used &= ~block.missing.T
-            mean, number = quiet_mean(signal, used)
-        least = np.where(number > 0, 0.0, FOOT * std)
-        mean, number = np.where(number > 0, mean, _lowest_levels(signal, std)), np.maximum(number, 1)
-    else:
+    drifts, least, own = spread > DRIFT * std, np.zeros(1), np.arange(n)
+    mean, number = np.zeros(n, np.float32), np.zeros(n, np.int64)
+    if not drifts:
         level = np.full(n, system.noise.baseline, np.float32)
         samples = Samples(block.samples, level, np.ones(n, np.float32), block.missing)
         mean, number = quiet_levels(samples, limit * np.hypot(SMOOTH_GAIN * std, spread), reach, recovery)
-        least = np.zeros(1)
         if MOST_LEAST < floor_share(system.noise.baseline, quiet) <= MOST_CUT:
             offset, response, _ = floor_response(system.noise.baseline, quiet)
             mean = (mean - offset) / response
+        own = np.flatnonzero((number == 0) & (spread > 0))
+    if len(own):
+        signal = transpose_samples(block.samples[own])
+        signal -= np.float32(system.noise.baseline)
+        above, used, seen = find_levels(signal, std, reach, limit, recovery)
+        if block.missing is not None:
+            used &= ~block.missing[own].T
+            above, seen = quiet_mean(signal, used)
+        if drifts:
+            least = np.where(seen > 0, 0.0, FOOT * std)
+            mean, number = np.where(seen > 0, above, _lowest_levels(signal, std)), np.maximum(seen, 1)
+        else:
+            # However far its level is from the strip's: echoes do not make most of a waveform flat.
+            recorded = len(signal) if block.missing is None else (~block.missing[own]).sum(axis=1)
+            flat = 2 * seen > recorded
+            mean[own[flat]], number[own[flat]] = above[flat], seen[flat]
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.noise.baseline + trust * mean
     error = np.maximum(spread * np.sqrt(1 - trust), least).astype(np.float32) if spread else None

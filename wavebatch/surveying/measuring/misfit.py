@@ -196,7 +196,7 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
     strong, weaker = part_strong(clear)
     if len(strong) < ENOUGH_FOR_TAIL:
         return system
-    left, others, profile = ResidualShares(block, system, strong), None, []
+    left, others, parts, flanks = ResidualShares(block, system, strong), None, {}, {}
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
         if abs(place) < 3 or (seen := left.look(place)).number < ENOUGH_FOR_TAIL:
             continue
@@ -204,7 +204,7 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
         scatter = 2 * np.sqrt(seen.spread**2 - left.noise**2)
         share, chance = abs(seen.common) + scatter, SURE / np.sqrt(seen.number)
         is_part = abs(seen.common) > max(CONSTANT * scatter, SURE * seen.error)
-        higher = seen.median > seen.common + seen.spread
+        higher, all_have = seen.median > seen.common + seen.spread, False
         if not higher:
             # A tail that changes from shot to shot scatters, but hardly any echo is without it, as without a neighbour.
             all_have = NORMAL_BELOW[0] * seen.number > 1 and seen.lowest > LOWEST_ERROR * left.noise * chance
@@ -214,13 +214,21 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
             others = others or ResidualShares(block, system, weaker)
             other = others.look(place)
             more = np.sign(seen.common) * other.common - abs(seen.common)
-            is_part = more <= (LARGER if higher else SURE) * np.hypot(seen.error, other.error)
+            is_part = more <= (SURE if all_have else LARGER) * np.hypot(seen.error, other.error)
             is_part &= other.number >= ENOUGH_FOR_TAIL or not higher
         elif higher:  # most echoes have a neighbour there, perhaps all of them
             is_part = False
         # Higher ones are targets: rows of crops, and roofs over the ground, have one distance.
-        if is_part and PART > share > min(LEAST_TAIL, 2 * left.noise):
-            profile.append((float(place * system.sigma_ref), float(share)))
+        if PART > share > min(LEAST_TAIL, 2 * left.noise):
+            if is_part:
+                parts[place] = share
+            elif not higher and seen.common > SURE * seen.error:
+                flanks[place] = share
+    # A part that moves from shot to shot is in some waveforms only beside its place.
+    for place in flanks.keys() & {beside for part in parts for beside in (part - 1, part + 1)}:
+        flanks[place] = max(flanks[place], parts.get(place - 1, 0.0), parts.get(place + 1, 0.0))
+        parts[place] = flanks[place]
+    profile = ((float(place * system.sigma_ref), float(share)) for place, share in sorted(parts.items()))
     return replace(system, tail_misfit=tuple(profile))
 
 
@@ -318,19 +326,23 @@ class ResidualShares:
         taps = gaussian_taps(ref)
         energy = filter_energy(taps)
         residual = subtract_echoes(part, system, fitted)[fitted.waveform]
-        self.lag = (np.arange(residual.shape[1]) - (fitted.time / part.spacing)[:, None]) / ref
+        self.time, self.step = fitted.time / part.spacing, ref
         # What broad parts of the model have there is not taken off an echo before it, in a cluster of its own.
         whole = subtract_echoes(part, system, fitted.take(np.empty(0, np.int64)))[fitted.waveform]
-        residual = np.where(self.lag < -ONSET, whole, residual)
+        residual = np.where(np.arange(residual.shape[1]) < (self.time - ONSET * ref)[:, None], whole, residual)
         share = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
-        self.share = share / fitted.amplitude[:, None]
-        self.lag[~np.isfinite(residual)] = np.nan
+        self.share = np.where(np.isfinite(residual), share / fitted.amplitude[:, None], np.nan)
         self.noise = float(system.noise.std / median(fitted.amplitude) / np.sqrt(energy))
 
     def look(self, place: int) -> Seen:
-        """What is left within half a width of the pulse of this lag [widths]."""
-        inside = (self.lag >= place - 0.5) & (self.lag < place + 0.5)
-        here, number = self.share[inside], int(np.count_nonzero(inside.any(axis=1)))
+        """What is left at this lag [widths of the pulse]: between samples, so that a part's slope is no scatter."""
+        at = self.time + place * self.step
+        row = np.flatnonzero((at >= 0) & (at < self.share.shape[1] - 1))
+        before = at[row].astype(np.int64)
+        part = at[row] - before
+        here = (1 - part) * self.share[row, before] + part * self.share[row, before + 1]
+        here = here[np.isfinite(here)]
+        number = len(here)
         if not number:
             return Seen(1, 0.0, 0.0, 0.0, np.inf)
         lowest, low = quantiles(here, NORMAL_BELOW)
