@@ -71,6 +71,7 @@ def test_what_a_strip_lacks_is_named_by_all_that_read_packets(tmp_path, command)
     strip = raw.write(tmp_path / "strip.las")
     for quiet in ([], ["-q"]):
         said = succeed(command, strip, "-o", tmp_path / more[0], *more[1:], "--overwrite", *quiet).stderr
+        assert "the header claims" in succeed("stats", strip).stdout
         lost = "with a packet before the start" if command == "run" else "cannot be used"
         assert "warning: the header claims" in said and lost in said, said
 

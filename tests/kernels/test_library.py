@@ -128,6 +128,8 @@ def test_without_a_compiler_pip_is_asked_for_one(checkout, monkeypatch, tmp_path
     refuses(InputError, "no C compiler found: install cc, gcc or clang, set CC, or `pip install", load_number)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "ziglang")
     assert checkout.find_compiler()[:4] == [sys.executable, "-m", "ziglang", "cc"]
+    monkeypatch.setenv("CC", "/no/cc -pipe")
+    refuses(InputError, "the C compiler that CC names is not there: /no/cc; unset CC", load_number)
     monkeypatch.setenv("CC", "ccache 'my cc' -pipe")
     assert checkout.find_compiler() == ["ccache", "my cc", "-pipe"]
     assert "ziglang" not in checkout.get_requires_for_build_wheel()

@@ -51,6 +51,8 @@ def compile_library(target: Path = LIBRARY, flags: tuple[str, ...] = ()) -> None
     command = find_compiler()
     if command is None:
         raise RuntimeError("no C compiler found: install cc, gcc or clang, set CC, or `pip install ziglang`")
+    if shutil.which(command[0]) is None:
+        raise RuntimeError(f"the C compiler that CC names is not there: {command[0]}; unset CC, or name another")
     source_time = _source_time()
     is_windows = sys.platform == "win32"
     position, mathematics = ((), ()) if is_windows else (("-fPIC",), ("-lm",))  # Windows needs neither

@@ -409,7 +409,7 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter,
         placed = [one.place(path) if isinstance(one, PolygonSet) else (one, "") for one in divisions]
         areas = [AreaTally(division) for division, _ in placed]
         tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
-        tally.notes = [line for _, line in placed if line]
+        tally.notes = [*reader.unread, *(line for _, line in placed if line)]
         tally.metres = reader.metres
         if math.isnan(reader.metres[0]):
             tally.notes.append(f"coordinates are {reader.unit}: returns have no distances; project the cloud to metres")

@@ -114,7 +114,7 @@ class CloudReader(Closing):
         self.point_count: int = checked.header.point_count
         self.scales: tuple[float, ...] = checked.header.scales
         self.offsets: tuple[float, ...] = checked.header.offsets
-        self._header = checked.header
+        self._header, self.unread = checked.header, checked.unread
         units = read_crs(self.path, checked.header)[1]
         self.metres = metres_per_unit(units)
         """Metres of a step of 1 in x, y and z; NaN in degrees."""
