@@ -38,7 +38,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable, PulseTail
 from wavebatch.kernels.geometry.planes import Planes, compare_halves
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_correlated, find_maxima, quiet_levels
-from wavebatch.kernels.signal.noise import coloured_variance, fit_factors, measure_covariance
+from wavebatch.kernels.signal.noise import coloured_variance, find_levels, fit_factors, measure_covariance
 
 FLAGS = ("-g", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
 SETTINGS = {
@@ -194,6 +194,7 @@ def look_for(samples: Samples, candidates: Candidates, rng: np.random.Generator)
     level = samples._replace(baseline=samples.baseline if samples.baseline.ndim == 1 else samples.baseline[:, 0])
     reach, recovery = (int(value) for value in rng.integers(0, 3 * s + 2, 2))
     quiet_levels(level, float(10 ** rng.uniform(-9, 12)), reach, recovery)
+    find_levels(samples.counts.T, float(10 ** rng.uniform(-3, 3)), reach, 4.0, recovery, rng.integers(0, 2 * s, n))
     taps = rng.normal(size=int(rng.integers(1, 2 * s + 2)))
     for broad in (0.0, float(10 ** rng.uniform(-2, 3))):
         found = find_maxima(samples, float(rng.choice([0.0, 2.0])), float(10 ** rng.uniform(-2, 3)), broad, taps)

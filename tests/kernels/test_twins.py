@@ -170,12 +170,14 @@ def test_ends_lie_before_the_first_and_after_the_last_signal(rng, recovery):
 @pytest.mark.parametrize("recovery", [0, 30])
 def test_levels_are_those_of_single_waveforms(rng, recovery):
     signal = record(rng, level=rng.uniform(10, 90, 40))
-    levels, quiet, number = noise_kernels.find_levels(signal, 1.25, 3, recovery=recovery)
+    counted = rng.integers(0, len(signal) + 9, signal.shape[1])
+    levels, quiet, number, lowest = noise_kernels.find_levels(signal, 1.25, 3, recovery=recovery, counted=counted)
     for w in range(signal.shape[1]):
         level, used = naive_signal.find_level(signal[:, w].astype(float), 1.25, 3, recovery=recovery)
         assert levels[w] == pytest.approx(level, abs=1e-4)
         np.testing.assert_array_equal(quiet[:, w], used)
-        assert number[w] == used.sum()
+        assert number[w] == used[: counted[w]].sum()
+        assert lowest[w] == sorted(signal[:, w])[len(signal) // 10]
 
 
 def test_correlations_are_those_of_pairs(rng):

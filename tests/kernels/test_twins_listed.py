@@ -36,6 +36,7 @@ COMPILED = {
     "find_two_lines": ("in_two_lines", "test_hough.on_two_lines"),
     "trim_planes": ("fit_planes", "test_planes.naive_plane"),
     "coloured_variance": ("colour_factors", "naive_signal.colour_factors"),
+    "find_levels": ("find_levels", "naive_signal.find_level"),
     "explain_tails": ("explain_tails", "test_maxima.naive_tails"),
     "compare_halves": ("compare_halves", "naive.compare_halves"),
     "fit_factors": ("fit_factors", "naive_signal.fit_factors"),
@@ -49,7 +50,7 @@ HARD = {
     "match_returns": "naive.match_returns",
     "cross_voxels": "test_voxel_kernels.walk", "angles_above": "naive_physics.angle_above",
     "estimate_canopy_ratio": "naive_physics.estimate_canopy_ratio", "judge_energies": "naive_physics.judge_energies",
-    "find_levels": "naive_signal.find_level", "measure_recovery": "naive_signal.measure_recovery",
+    "measure_recovery": "naive_signal.measure_recovery",
     "deconvolve_gold": "naive.gold", "thin_out": "naive_geometry.thin_out",
 }  # fmt: skip
 

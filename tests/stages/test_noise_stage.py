@@ -8,10 +8,11 @@ import pytest
 
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
+from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import maximum
-from wavebatch.stages.noise import _lowest_levels, pooled
+from wavebatch.stages.noise import LOWEST_TENTH, pooled
 from wavebatch.stages.pulse_tables import noise_factors
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.5, std=1.1))
@@ -108,7 +109,8 @@ def test_a_wrong_level_is_neither_an_echo_nor_an_amplitude(correlation):
 
 def test_the_lowest_tenth_of_noise_gives_its_level(rng):
     signal = rng.normal(12.0, 2.0, (100, 400)).astype(np.float32)
-    assert _lowest_levels(signal, 2.0).mean() == pytest.approx(12.0, abs=0.2)
+    lowest = find_levels(signal, 2.0, 3).lowest + LOWEST_TENTH * 2.0
+    assert lowest.mean() == pytest.approx(12.0, abs=0.2)
 
 
 def test_the_level_of_a_recording_has_an_error_of_its_own():

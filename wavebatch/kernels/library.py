@@ -25,7 +25,7 @@ FUNCTIONS = (
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes", "match_returns", "weigh_fits",
     "finish_echoes", "find_pulses", "find_nearest", "number_returns", "share_offsets", "find_around",
     "measure_lobes", "find_two_lines", "trim_planes", "coloured_variance", "fit_factors",
-    "compare_halves", "explain_tails",
+    "compare_halves", "explain_tails", "find_levels",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -139,6 +139,12 @@ class Grouping(ctypes.Structure):
     """`Grouping` of kernels/c/signal.h."""
 
     _fields_ = [*_fields(ctypes.c_int64, "margin reach most"), *_fields(_POINTER, "tail")]
+
+
+class CQuiet(ctypes.Structure):
+    """`Quiet` of kernels/c/signal.h."""
+
+    _fields_ = [*_fields(ctypes.c_float, "width extra strong"), *_fields(ctypes.c_int64, "reach recovery least")]
 
 
 class CTail(ctypes.Structure):

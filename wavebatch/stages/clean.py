@@ -153,7 +153,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
         signal = clean_block(block, replace(system, defects=defects)).samples.T
         level = median(signal, axis=0)
     elif system.noise.baseline_spread > DRIFT * std:
-        level = find_levels(signal, std, reach)[0]
+        level = find_levels(signal, std, reach).level
     else:
         level = np.float32(system.noise.baseline)
     above = signal - level

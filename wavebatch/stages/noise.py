@@ -78,13 +78,14 @@ def pooled(
     if len(own):
         signal = transpose_samples(block.samples[own])
         signal -= np.float32(system.noise.baseline)
-        above, used, seen = find_levels(signal, std, reach, limit, recovery)
+        above, used, seen, lowest = find_levels(signal, std, reach, limit, recovery)
         if block.missing is not None:
             used &= ~block.missing[own].T
             above, seen = quiet_mean(signal, used)
         if drifts:
             least = np.where(seen > 0, 0.0, FOOT * std)
-            mean, number = np.where(seen > 0, above, _lowest_levels(signal, std)), np.maximum(seen, 1)
+            lowest += np.float32(LOWEST_TENTH * std)
+            mean, number = np.where(seen > 0, above, lowest), np.maximum(seen, 1)
         else:
             # However far its level is from the strip's: echoes do not make most of a waveform flat.
             recorded = len(signal) if block.missing is None else (~block.missing[own]).sum(axis=1)
@@ -110,12 +111,11 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     if not len(row):
         return noise
     s, length = block.samples.shape[1], end - start
-    # Each recording as a column, repeated up to the length of the waveform, so that quantiles stay what they are.
-    signal = block.samples[row, start + np.arange(s)[:, None] % length].astype(np.float32)
-    std = float(noise.std[0])
-    level, quiet, _ = find_levels(signal, std, int(np.ceil(system.sigma_ref / block.spacing)), limit)
-    number = (quiet & (np.arange(s)[:, None] < length)).sum(axis=0)
-    level = np.where(number >= LEAST_QUIET, level, _lowest_levels(signal, std))
+    # Each recording is repeated up to the length of the waveform, so that quantiles stay what they are.
+    place = start[:, None] + np.arange(s) % length[:, None]
+    std, reach = float(noise.std[0]), int(np.ceil(system.sigma_ref / block.spacing))
+    level, _, number, lowest = find_levels(block.samples[row[:, None], place].T, std, reach, limit, counted=length)
+    level = np.where(number >= LEAST_QUIET, level, lowest + np.float32(LOWEST_TENTH * std))
     # The mean of correlated samples scatters more than that of as many independent ones.
     spread = std * np.sqrt(max(1.0, 1.0 + 2.0 * float(np.sum(system.noise.correlation))))
     apart = np.abs(level - noise.baseline[row]) > APART * spread / np.sqrt(np.maximum(number, 1)) + MARGIN * std
@@ -128,12 +128,6 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     error = np.zeros(len(block), np.float32) if noise.baseline_err is None else noise.baseline_err.copy()
     np.maximum.at(error, row[apart], known[apart].astype(np.float32))
     return replace(noise, of_sample=of_sample, baseline_err=error)
-
-
-def _lowest_levels(signal: np.ndarray, std: float) -> np.ndarray:
-    """Level (n,) of waveforms (s, n) by their lowest samples, where echoes leave no quiet ones."""
-    at = len(signal) // 10
-    return np.partition(signal, at, axis=0)[at] + np.float32(LOWEST_TENTH * std)
 
 
 @stage("noise")

@@ -116,7 +116,7 @@ def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     """Level and noise of one descriptor, from each waveform's own quiet samples."""
     signal = transpose_samples(block.samples)
     reach = int(np.ceil(3 * plain.sigma_ref / block.spacing))
-    _, quiet, _ = find_levels(signal, plain.noise.std, reach)
+    quiet = find_levels(signal, plain.noise.std, reach).quiet
     if block.missing is not None:
         quiet &= ~block.missing.T
     # Only what comes before the first signal: long packets have more echoes, and what lies between them is no level.

@@ -19,7 +19,7 @@ import numpy as np
 from wavebatch.core.order import known_median, median, quantile, quantiles
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, log, solve
-from wavebatch.kernels.library import call
+from wavebatch.kernels.library import CQuiet, call
 from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
     STRONG,
@@ -583,28 +583,43 @@ def measure_recovery(
     return int(np.argmax(np.r_[right, True])) * step
 
 
+class OwnLevels(NamedTuple):
+    """Levels of n waveforms from themselves alone."""
+
+    level: np.ndarray
+    """float32 (n,), count."""
+    quiet: np.ndarray
+    """Quiet samples, bool (s, n)."""
+    number: np.ndarray
+    """How many of these count, int64 (n,)."""
+    lowest: np.ndarray
+    """Value that a tenth of the samples lie below, float32 (n,), count."""
+
+
 def find_levels(
-    signal: np.ndarray, std: float, reach: int, limit: float = 4.0, recovery: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Level of each waveform of signal (s, n) from itself alone, (n,), its quiet samples (s, n) and their number (n,).
+    signal: np.ndarray,
+    std: float,
+    reach: int,
+    limit: float = 4.0,
+    recovery: int = 0,
+    counted: np.ndarray | None = None,
+) -> OwnLevels:
+    """Level of each waveform of signal (s, n) from itself alone.
 
     For baselines that scatter by more than the noise: a common level with so much room would take echoes for quiet.
     Begins with the lower quartile, which echoes on up to half of the samples hardly move. std: noise of a sample.
-    recovery: as for `find_quiet`, where it leaves enough samples.
+    recovery: as for `find_quiet`, where it leaves enough samples. counted: the first samples of each that `number`
+    counts, int64 (n,); all by default.
     """
-    level = np.partition(signal, len(signal) // 4, axis=0)[len(signal) // 4]
+    signal, (s, n) = np.ascontiguousarray(signal.T, np.float32), signal.shape
     width = np.float32(limit * SMOOTH_GAIN * std + 0.25)
-    for extra in (std, 0.0, 0.0):
-        quiet = find_quiet(signal - level, width + np.float32(extra), reach)
-        mean, number = quiet_mean(signal - level, quiet)
-        level = level + mean
-    if recovery > reach:
-        clear = find_quiet(signal - level, width, reach, recovery)
-        mean, clear_number = quiet_mean(signal - level, clear)
-        enough = clear_number >= LEAST_BEFORE
-        level = level + np.where(enough, mean, np.float32(0))
-        quiet, number = np.where(enough, clear, quiet), np.where(enough, clear_number, number)
-    return level, quiet, number
+    counted = np.ascontiguousarray(np.full(n, s) if counted is None else np.minimum(counted, s), np.int64)
+    level, lowest = np.empty((2, n), np.float32)
+    found = OwnLevels(level, np.empty((n, s), np.bool_), np.empty(n, np.int64), lowest)
+    if signal.size:
+        rules = CQuiet(width, std, width * np.float32(STRONG), reach, recovery, LEAST_BEFORE)
+        call("find_levels", *map(ctypes.c_int64, (n, s)), signal, rules, counted, *found)
+    return found._replace(quiet=found.quiet.T)
 
 
 def keep_longest(missing: np.ndarray) -> np.ndarray:
