@@ -557,6 +557,14 @@ def test_returns_have_their_scatter_and_echoes_without_one_the_phase_or_how_far_
         assert error == pytest.approx(np.hypot(ERROR, other), rel=1e-3)
 
 
+@pytest.mark.parametrize(("phase", "held"), [(0.29, 2.0), (0.9, 0.03), (0.0, 0.03)])
+def test_an_offset_that_is_no_phase_is_in_the_error(phase, held):
+    """A vendor's one return in the middle of two surfaces .7 m apart: both were .35 m off, with errors of 1 mm."""
+    at, error = place([20.0, 24.0], [22.0], returns=0.03 * HALF_C, phase=phase * HALF_C)
+    assert abs(at[0] - 20.0) == pytest.approx(2.0, abs=1e-3)
+    assert error == pytest.approx(np.hypot(ERROR, held), rel=1e-3)
+
+
 SYSTEMS = {
     "gaussian": SystemPulse(2.0),
     "learned": SystemPulse(2.0, components=((1.0, 0.0, 2.0), (0.1, 5.0, 2.2))),

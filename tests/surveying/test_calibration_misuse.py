@@ -818,6 +818,8 @@ def test_air_that_is_not_given_thins_with_the_height_above_sea(tmp_path, fall, g
 def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):
     fail(2, "less than any air has near the ground; is it per metre?", "run", calibrated / "a.las", "-o", tmp_path,
          "--calibration", calibrated / "cal.toml", "--attenuation", 0.0003)  # fmt: skip
+    fail(2, "22 dB/km is fog, in which nobody flies; is it 0.22?", "calibrate", calibrated / "a.las", "--targets",
+         calibrated / "t.csv", "-o", tmp_path / "c.toml", "--attenuation", 22)  # fmt: skip
     fail(2, "is it per metre?", "calibrate", calibrated / "a.las", "--targets", calibrated / "t.csv", "-o",
          tmp_path / "c.toml", "--attenuation", 0.0003)  # fmt: skip
 

@@ -26,8 +26,9 @@ NEEDS_SENSOR = (
 )  # fmt: skip
 """Columns that need the sensor's position."""
 
-LEAST_ATTENUATION = 0.01
-"""Of air near the ground [dB/km]: what molecules alone scatter at 1064 nm is 0.004, and haze is never absent."""
+LEAST_ATTENUATION, MOST_ATTENUATION = 0.01, 12.0
+"""Of air near the ground [dB/km]: what molecules alone scatter at 1064 nm is 0.004, and haze is never absent. Nobody
+flies by sight below a visibility of 1.5 km, where green light loses 11."""
 
 _REPORTED = ("strip", "date", "sensor", "flight", "chain", "decomposer", "height", "distance")
 _MOST_DESCRIBED = 8
@@ -35,10 +36,14 @@ _MOST_DESCRIBED = 8
 
 
 def check_attenuation(value: float) -> None:
-    """Raise ConfigError for an attenuation [dB/km] that no air has, as of a value per metre; 0 is no air at all."""
+    """Raise ConfigError for an attenuation [dB/km] that no flight has, as of a value per metre; 0 is no air at all."""
     if 0.0 < value < LEAST_ATTENUATION:
-        problem = f"attenuation: {value:g} dB/km is less than any air has near the ground"
-        raise ConfigError(f"{problem}; is it per metre? Clear air has 0.1 to 0.5 dB/km")
+        problem = f"attenuation: {value:g} dB/km is less than any air has near the ground; is it per metre?"
+    elif value > MOST_ATTENUATION:
+        problem = f"attenuation: {value:g} dB/km is fog, in which nobody flies; is it {value / 100:g}?"
+    else:
+        return
+    raise ConfigError(f"{problem} Clear air has 0.1 to 0.5 dB/km")
 
 
 CHANGE_CHANCE = 0.3

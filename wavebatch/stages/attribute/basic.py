@@ -177,12 +177,14 @@ def position(
 ) -> EchoTable:  # fmt: skip
     """Coordinates of each echo along its ray [m], relative to the returns of its packet, and the return it matches.
 
-    Return locations differ from the fit by an offset that all returns of a packet share (phase of the emitted pulse, a
-    detector of leading edges). The offset is measured on the matched returns and subtracted. Besides the error of the
-    fit, range_err has that of the returns: their scatter in this strip, or, where the returns of a packet contradict
-    each other by more, the error of their mean. Returns that lie off the packet's ray by more than a sample (bent at
-    a water surface) put that into it. Packets without a matched return keep the raw location and are flagged;
-    their error has what locations differ from echoes in the strip, and how far their nearest return is from an echo.
+    Return locations differ from the fit by an offset that all returns of a packet share (phase of the emitted
+    pulse, a detector of leading edges). The offset is measured on the matched returns and subtracted. Besides the
+    error of the fit, range_err has that of the returns: their scatter in this strip, or, where the returns of a
+    packet contradict each other by more, the error of their mean, and an offset that is 3 times that of the strip's
+    lone echoes: such a return is the mean of two surfaces, or another one's. Returns that lie off the packet's ray
+    by more than a sample (bent at a water surface) put that into it. Packets without a matched return keep the raw
+    location and are flagged; their error has what locations differ from echoes in the strip, and how far their
+    nearest return is from an echo.
 
     Parameters
     ----------
@@ -234,8 +236,11 @@ def position(
     speed = np.sqrt(east**2 + north**2 + up**2)
     # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
-    shared = np.where(known, np.maximum(doubt * speed, system.radiometry.returns),
-                      np.maximum(apart * speed, system.radiometry.phase))  # fmt: skip
+    phase, shift = system.radiometry.phase, np.abs(offset) * speed
+    # An offset far beyond those of lone echoes is no phase: the return is of two surfaces, or of another one.
+    shift = np.where((phase > 0) & (shift > STRANGE_SHIFT * phase), shift, 0.0)
+    shared = np.where(known, np.maximum(np.maximum(doubt * speed, shift), system.radiometry.returns),
+                      np.maximum(apart * speed, phase))  # fmt: skip
     echoes = echoes.with_attributes(
         x=xyz[:, 0],
         y=xyz[:, 1],
@@ -249,6 +254,9 @@ def position(
         return echoes
     return echoes.with_flags(EchoFlag.ADDED, point < 0).with_flags(EchoFlag.UNANCHORED, ~known[waveform])
 
+
+STRANGE_SHIFT = 3.0
+"""Offset of a packet over the root mean square of those of lone echoes: phases are even over a sample, up to 1.7."""
 
 NARROW_ERRORS = 3.0
 """An echo whose variance is negative by so many errors is flagged as narrower than the system pulse."""
