@@ -14,7 +14,7 @@ import numpy as np
 
 from wavebatch.core.echoes import SUFFIX, EchoFlag, EchoTable, NoData, explain_no_data
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, LEAST_PULSE_WIDTH, SQRT_2PI
+from wavebatch.core.units import AIR_SPEED, FWHM_PER_SIGMA, HALF_C, LEAST_PULSE_WIDTH, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, residual_moments
 from wavebatch.kernels.fit.render import render_echoes
@@ -236,6 +236,11 @@ def position(
     speed = np.sqrt(east**2 + north**2 + up**2)
     # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
+    # Between return and echo, vectors that are not as long as light is fast miss by the difference.
+    missed, wrong = np.zeros(len(echoes)), np.maximum(np.abs(speed - HALF_C), np.abs(speed - AIR_SPEED))
+    if returns is not None and len(returns) and wrong.max(initial=0.0) > LEAST_WRONG * HALF_C:
+        first = np.searchsorted(returns.waveform, waveform).clip(max=len(returns) - 1)
+        missed = np.abs(along - returns.time[first]) * np.where(wrong > LEAST_WRONG * HALF_C, wrong, 0.0)[waveform]
     phase, shift = system.radiometry.phase, np.abs(offset) * speed
     # An offset far beyond those of lone echoes is no phase: the return is of two surfaces, or of another one.
     shift = np.where((phase > 0) & (shift > STRANGE_SHIFT * phase), shift, 0.0)
@@ -247,13 +252,16 @@ def position(
         z=xyz[:, 2],
         point=point,
         range_err=np.hypot(
-            echoes.time_err * speed[waveform], np.maximum(shared[waveform], bent * speed[waveform])
+            np.hypot(echoes.time_err * speed[waveform], missed), np.maximum(shared[waveform], bent * speed[waveform])
         ).astype(np.float32),
     )
     if returns is None:
         return echoes
     return echoes.with_flags(EchoFlag.ADDED, point < 0).with_flags(EchoFlag.UNANCHORED, ~known[waveform])
 
+
+LEAST_WRONG = 1e-3
+"""Error of a vector's length that counts: vendors may leave out the .0003 that air takes."""
 
 STRANGE_SHIFT = 3.0
 """Offset of a packet over the root mean square of those of lone echoes: phases are even over a sample, up to 1.7."""
