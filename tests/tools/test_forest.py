@@ -176,7 +176,10 @@ def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
     voxelize_strip(forest_strip, plain, VoxelOptions(1.0), system=SAVED, force=True)
     refuses(ConfigError, "--forest needs voxels: wavebatch voxelize", Forest, [plain], 10.0, ForestOptions())
     other = voxelize(forest_strip, tmp_path / "other.laz", size=2.0)
-    refuses(ConfigError, "has other voxels", Forest, [even[1], other], 10.0, ForestOptions())
+    refuses(ConfigError, "has other voxels than .*, of --size 1", Forest, [even[1], other], 10.0, ForestOptions())
+    higher = tmp_path / "higher.laz"
+    voxelize_strip(forest_strip, higher, VoxelOptions(1.0, forest=True, ground_height=0.9), system=SAVED, force=True)
+    refuses(ConfigError, "of --ground-height 0.5; give one", Forest, [even[1], higher], 10.0, ForestOptions())
     refuses(ConfigError, "cells need 4 voxels along a side; give 4 or more", Forest, [even[1]], 3.0, ForestOptions())
     with pytest.raises(ConfigError, match="layers are thinner than the voxels, .*; give 1 or more"):
         Forest([even[1]], 10.0, ForestOptions(layer=0.5))

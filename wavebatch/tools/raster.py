@@ -128,9 +128,11 @@ class Forest:
                                   "anew with wavebatch voxelize --forest")  # fmt: skip
             facts.append((path, found))
         self.size = facts[0][1]["size_m"]
-        other = next((path for path, one in facts if one["size_m"] != self.size), None)
-        if other is not None:
-            raise ConfigError(f"{other}: has other voxels than {paths[0]}, of {self.size:g} m; give files of one size")
+        for name, words in (("size_m", "--size"), ("ground_height_m", "--ground-height")):
+            first = facts[0][1].get(name)
+            other = next((path for path, one in facts if one.get(name) != first), None)
+            if other is not None:
+                raise ConfigError(f"{other}: has other voxels than {paths[0]}, of {words} {first}; give one")
         if cell_size < LEAST_SIDE * self.size:
             raise ConfigError(f"--size {cell_size:g}: cells need {LEAST_SIDE} voxels along a side; give "
                               f"{LEAST_SIDE * self.size:g} or more")  # fmt: skip

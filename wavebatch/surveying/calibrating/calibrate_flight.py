@@ -318,7 +318,7 @@ def _list_columns(ties: adjust.Ties, seen: np.ndarray) -> Iterator[tuple[str, np
 
 _UNEXPLAINED = (
     "the strips' light from one place differs by more than their constants explain: check targets, trajectory and "
-    "whether the overlaps are wet, rough or planted"
+    "whether the overlaps are wet, rough or planted, or channels have several wavelengths"
 )
 
 
