@@ -290,20 +290,6 @@ def test_every_ray_that_crossed_a_voxel_with_signal_counts(tmp_path):
     assert crowns[0]["share"] > 0.9 and crowns[1]["share"] == pytest.approx(crowns[0]["share"] / 2, abs=0.01)
 
 
-def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_path):
-    strip = tmp_path / "hills.las"
-    scene = replace(find_scene("urban"), flight=FlightLine(half_angle=3.0, pulse_rate=30_000.0))
-    simulate_strip(scene, strip, pulses=1500, seed=4)
-    near, far = (
-        voxelize(strip, tmp_path / "v.npz", 0.8, headroom=headroom, overwrite=True)[1] for headroom in (None, 300.0)
-    )
-    for name in ("index", "energy"):
-        assert np.array_equal(near[name], far[name])
-    # Signal high above all returns is rare, and noise.
-    for name in ("rays", "light", "path", "share"):
-        assert np.mean(near[name] != far[name]) < 0.01
-
-
 @pytest.mark.parametrize("most", [8, 100, 1 << 18])
 def test_ceilings_are_those_of_a_slow_search(most):
     rng = np.random.default_rng(9)

@@ -200,9 +200,6 @@ class AreaTally:
         self._areas = np.array(always, np.int64)
         self._sums = self._begin(len(always))
 
-    def __len__(self) -> int:
-        return len(self._areas)
-
     def _begin(self, number: int) -> np.ndarray:
         """The sums of areas of which nothing was counted."""
         sums = np.zeros(number, self._dtype)
@@ -386,7 +383,7 @@ def count_returns(
                 raise
             skip(error)
             continue
-        number += sum(map(len, tally.areas))
+        number += sum(len(one._areas) for one in tally.areas)
         if number > MOST_AREAS:
             raise ConfigError(f"{path}: more than {MOST_AREAS} areas with it; give a larger --area, or fewer clouds")
         each.append(tally.finish(str(path)))
