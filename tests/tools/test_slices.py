@@ -94,19 +94,25 @@ def test_facets_are_found_with_their_slope_and_place(strip):
         assert line.point[segment.first_pulse] == segment.first_point
 
 
+def make_line(origin, direction, time, *, samples=80, spacing=1.0, height=60.0, width=2.0, rng=None, number=0):
+    """A scan line of pulses with an echo each, at these times [ns]; with rng in noise of one count."""
+    n = len(time)
+    row, sample = np.repeat(np.arange(n), samples), spacing * np.tile(np.arange(samples), n)
+    value = height * np.exp(-0.5 * ((sample - np.asarray(time)[row]) / width) ** 2)
+    value += 0.0 if rng is None else rng.standard_normal(n * samples)
+    direction = np.broadcast_to(direction, (n, 3))
+    place = (np.arange(n), np.arange(n) * 1e-5, origin, direction)
+    return ScanLine(number, *place, spacing, row, sample, value.astype(np.float32))
+
+
 def fly_over(height, rng, step, half=40.0, altitude=600.0):
     """A scan line over a surface of the given height(place) [m], pulses `step` m apart, scatter 2 cm."""
     place = np.arange(-half, half, step)
-    n, count = len(place), 80
-    angle = np.arctan(place / altitude)
+    n, angle = len(place), np.arctan(place / altitude)
     direction = 0.149896 * np.stack([np.sin(angle), np.zeros(n), -np.cos(angle)], axis=1)
     ground = np.stack([place, np.zeros(n), height(place) + 0.02 * rng.standard_normal(n)], axis=1)
     time = 30 + rng.uniform(-5, 5, n)
-    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
-    value = 60 * np.exp(-0.5 * ((sample - time[row]) / 2.0) ** 2) + rng.standard_normal(n * count)
-    origin = ground - direction * time[:, None]
-    figures = (1.0, row, sample.astype(float), np.round(value).astype(np.float32))
-    return ScanLine(0, np.arange(n), np.arange(n) * 1e-5, origin, direction, *figures)
+    return make_line(ground - direction * time[:, None], direction, time, rng=rng)
 
 
 @pytest.mark.parametrize("degrees", [3, 8, 20])
@@ -132,14 +138,9 @@ def test_a_hill_a_wave_and_a_step_stay_one_line(bend):
 
 
 def test_time_geometry_finds_a_line_over_pulses_and_places_it_in_space():
-    n, count, spacing = 200, 80, 0.5
-    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
-    value = 50 * np.exp(-0.5 * ((sample * spacing - 10 - 0.05 * row) / 2.0) ** 2)
+    n = 200
     origin = np.stack([0.6 * np.arange(n), np.zeros(n), np.full(n, 100.0)], axis=1)
-    line = ScanLine(
-        *(4, np.arange(n), np.arange(n) * 1e-5, origin, np.tile([0, 0, -0.15], (n, 1)), spacing, row),
-        *(sample * spacing, value.astype(np.float32)),
-    )
+    line = make_line(origin, [0, 0, -0.15], 10 + 0.05 * np.arange(n), spacing=0.5, height=50, number=4)
     options = SliceOptions(geometry="time")
     (segment,) = find_segments(cut_slice(line, options), options)
     assert (segment.line, segment.first_pulse, segment.last_pulse) == (4, 0, 199)
@@ -193,18 +194,13 @@ def test_real_strip(riegl, tmp_path):
 
 def ground_line(starts, n=240, spacing=0.5, tilt=0.0):
     """A scan line over level ground 30 m below its highest sample; windows open `starts` [ns] after that height."""
-    count, speed = 90, 0.15
     angle = np.radians(np.linspace(-6, 6, n) + tilt)
-    direction = speed * np.stack([np.sin(angle), np.zeros(n), -np.cos(angle)], axis=1)
+    direction = 0.15 * np.stack([np.sin(angle), np.zeros(n), -np.cos(angle)], axis=1)
     sensor = np.array([0.0, 0.0, 700.0])
     top = sensor + direction * ((700.0 - 30.0) / -direction[:, 2])[:, None]
     origin = top + direction * starts[:, None]
-    ground = (origin[:, 2] - 0.0) / -direction[:, 2]
-    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
-    value = 60 * np.exp(-0.5 * ((sample * spacing - ground[row]) / 1.5) ** 2).astype(np.float32)
-    value += np.random.default_rng(1).normal(0, 1, len(value)).astype(np.float32)
-    place = (np.arange(n), np.arange(n) * 1e-5, origin, direction)
-    return ScanLine(0, *place, spacing, row, sample * spacing, value)
+    return make_line(origin, direction, origin[:, 2] / -direction[:, 2], samples=90, spacing=spacing, width=1.5,
+                     rng=np.random.default_rng(1))  # fmt: skip
 
 
 @pytest.mark.parametrize("tilt", [0.0, 25.0])
@@ -251,13 +247,10 @@ def test_both_geometries_find_the_ground_of_a_strip(tmp_path_factory):
 @pytest.mark.parametrize("slope", [0.0, 0.5, 1.0])
 def test_the_residual_of_a_time_slice_is_the_scatter_of_times(slope):
     """Echoes `slope` samples later per pulse and 0.6 ns early and late in turn: the residual is 0.6 ns at any slope."""
-    n, count, off = 60, 100, 0.6
+    n, off = 60, 0.6
     time = 20.0 + slope * np.arange(n) + off * np.where(np.arange(n) % 2, 1.0, -1.0)
-    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
-    value = (100 * np.exp(-0.5 * ((sample - time[row]) / 2.0) ** 2)).astype(np.float32)
-    down = np.tile([0.0, 0.0, -0.149896], (n, 1))
     origin = np.stack([0.5 * np.arange(n), np.zeros(n), np.full(n, 100.0)], axis=1)
-    line = ScanLine(0, np.arange(n), np.arange(n) * 1e-5, origin, down, 1.0, row, sample.astype(float), value)
+    line = make_line(origin, [0.0, 0.0, -0.149896], time, samples=100, height=100)
     options = SliceOptions(geometry="time", sigma=2.0)
     (segment,) = find_segments(cut_slice(line, options), options)
     # Only samples above the threshold count, which draws the centroids together a little.
