@@ -262,6 +262,12 @@ def test_counts_go_to_stdout_and_talk_to_stderr(strip, tmp_path):
     assert (tmp_path / "w.npz").read_bytes() == (tmp_path / "v.npz").read_bytes()
 
 
+def test_a_folder_gets_points_where_grid_reads_them(strip, tmp_path):
+    for words in ((), ("--forest",)):
+        succeed("voxelize", strip, "--size", 5, "-o", tmp_path, "-q", *words)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["urban.laz", "urban.npz"]
+
+
 def test_a_saved_survey_gives_the_same_voxels(strip, tmp_path):
     system = tmp_path / "SYSTEM.toml"
     assert run_command("survey", strip, "-o", system).exit_code == 0

@@ -114,6 +114,9 @@ def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rng, tmp_path):
         assert found.bounds.left <= 500_100 and found.bounds.right >= 500_200.5
         west, east = found.bounds.left, found.bounds.right
         part = found.read(1, masked=True).sum()
+    _run(tmp_path / "a.las", "--column", "y", "--size", 7, "-o", tmp_path / "z.tif")
+    with rasterio.open(tmp_path / "z.tif") as found:
+        assert found.dtypes == ("float64",), "float32 holds half metres of a northing"
     _run(tmp_path / "a.las", "--statistic", "count", "--size", 7, "-o", tmp_path / "y.tif")
     with rasterio.open(tmp_path / "y.tif") as found:
         whole = found.read(1, masked=True)
@@ -175,7 +178,8 @@ def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rng, tmp_pa
     result = _run(tmp_path / "*.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
     assert "has another CRS than" in result.stderr
     _cloud(tmp_path / "c.las", rng, 50, wkt=None)
-    assert "have no CRS" in _run(tmp_path / "c.las", "--statistic", "count", "-q", "-o", tmp_path / "x.tif").stderr
+    said = _run(tmp_path / "c.las", "--statistic", "count", "-q", "-o", tmp_path / "x.tif").stderr
+    assert "have no CRS" in said and "have a value" not in said, "50 of 210,000 cells: the raster is small"
 
 
 RIPROCESS = (

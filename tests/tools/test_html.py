@@ -161,6 +161,7 @@ def test_a_page_that_cannot_be_drawn_hides_neither_clouds_nor_survey(tiny_strip,
 def test_outliers_are_far_from_the_others_and_few_strips_have_none():
     usual = [{"noise": 1.0 + 0.01 * n, "echoes": 1.2, "pulse": 4.0} for n in range(8)]
     assert not any(find_outliers(usual, [""] * 8)) and set(usual[0]) < set(FIGURES)
+    assert not any(find_outliers([{"noise": 1.0 + 0.1 * n} for n in range(8)], [""] * 8)), "all of them differ"
     marked = find_outliers([*usual, {"noise": 2.0, "echoes": float("nan"), "pulse": 4.01}], [""] * 9)
     assert [sorted(one) for one in marked] == [[]] * 8 + [["noise"]]
     assert "usual is 1.04" in marked[-1]["noise"]

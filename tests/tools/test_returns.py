@@ -143,7 +143,9 @@ def test_text_has_every_figure(tmp_path):
     for text in wanted:
         assert text in result.stdout
     other = write_cloud(tmp_path / "d.las", **SMALL)
-    assert "total" in CliRunner().invoke(stats, [str(path), str(other)]).stdout
+    table = tmp_path / "t.csv"
+    assert "total" in CliRunner().invoke(stats, [str(path), str(other), "-o", str(table)]).stdout
+    assert [line.split(",")[0] for line in table.read_text().splitlines()[1:]] == [str(path), str(other), "total"]
     assert "total" not in CliRunner().invoke(stats, [str(path), str(path)]).stdout  # one file counts once
 
 
