@@ -69,7 +69,7 @@ def test_clouds_in_feet_are_compared_in_metres(clouds):
     (height,) = struct.unpack_from("<d", content, 171)
     struct.pack_into("<d", content, 171, height + 0.1)  # 0.1 ft are 0.2 ns; as metres they would be 0.67 ns
     shifted.write_bytes(content)
-    found = json.loads(_print("compare", clouds["ft"], shifted, "--tolerance", 0.3, "--json").stdout)
+    found = json.loads(_print("compare", clouds["ft"], shifted, "--within", 0.3, "--json").stdout)
     assert found["identical"] == 1.0
     line = _print("compare", clouds["deg"], clouds["deg"], code=2).stderr
     assert "coordinates are degrees, which have no length; project it to metres" in line and line.count("\n") == 1
