@@ -76,6 +76,14 @@ def test_what_a_strip_lacks_is_named_by_all_that_read_packets(tmp_path, command)
         assert "warning: the header claims" in said and lost in said, said
 
 
+@pytest.mark.slow
+def test_python_without_docstrings_runs(tmp_path):
+    """The meanings of parameters are docstrings: under PYTHONOPTIMIZE=2 no stage could be declared."""
+    simulate_strip("flat", tmp_path / "a.las", pulses=60, seed=1)
+    command = [sys.executable, "-OO", "-m", "wavebatch", "run", "a.las", "-o", "out", "-q"]
+    subprocess.run(command, cwd=tmp_path, check=True, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
+
+
 def test_infinite_times_are_no_warning_of_numpy(tmp_path):
     strip = tmp_path / "a.las"
     simulate_strip("urban", strip, pulses=300, seed=1)

@@ -401,6 +401,7 @@ def test_descriptions_fit_and_end_with_the_unit(column):
     meaning = text.rpartition(" [")[0]
     error = f"1 sigma of {column.name.removesuffix('_err')}"
     assert not column.extra_bytes or meaning in (SHORT.get(column.name), column.meaning, error), "the meaning is cut"
+    assert column.name != "range_err" or meaning == "1 sigma of place along ray"  # that of range is range_error
 
 
 @pytest.mark.parametrize("style", STYLES)

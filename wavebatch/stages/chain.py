@@ -15,6 +15,7 @@ import dataclasses
 import functools
 import inspect
 import re
+import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field, replace
@@ -217,10 +218,11 @@ def _declare(name: str, source: Callable | type, defaults: Mapping[str, Any]) ->
     meanings = {head: " ".join(text.split()) for head, text in zip(entries[::2], entries[1::2], strict=True)}
     parameters = {}
     for key, default in defaults.items():
-        if default is inspect.Parameter.empty or not meanings.get(key):
+        # `python -OO` has no docstrings: then parameters have no meaning, but chains run.
+        if default is inspect.Parameter.empty or not (meanings.get(key) or sys.flags.optimize > 1):
             raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
         kinds, choices, limits = read_hint(hints[key])
-        parameters[key] = Parameter(key, kinds, default, meanings[key], choices, limits)
+        parameters[key] = Parameter(key, kinds, default, meanings.get(key, ""), choices, limits)
     return parameters
 
 

@@ -106,6 +106,7 @@ _SHORT = {
     "reflectance": "reflectance at true angle",
     "level_reflectance": "reflectance if level",
     "level_reflectance_err": "1 sigma, slope unknown",
+    "range_err": "1 sigma of place along ray",
     "range_error": "1 sigma of range with sensor",
     "skew": "skew; 0 is a Gaussian",
     **{f"relative_{name}": "relative to strip" for name in _RELATIVE},
