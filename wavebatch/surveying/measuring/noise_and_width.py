@@ -327,7 +327,7 @@ def find_flat_tops(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     level = system.noise.baseline
     height = block.samples.max(axis=1) - np.float32(level)
     open_top = height < (np.inf if system.saturation is None else system.saturation - level)
-    if np.count_nonzero(open_top) < SMALL_PILE:
+    if np.count_nonzero(open_top) < SMALL_PILE or block.samples.shape[1] < 2:
         return system
     top = float(np.partition(height[open_top], -FEW)[-FEW])
     share = np.where(open_top, height / max(top, 1e-9), 0.0)
