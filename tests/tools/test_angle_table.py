@@ -11,7 +11,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import LevelWidths, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import bound_time
-from wavebatch.kernels.physics.incidence import angles_of_variance
+from wavebatch.kernels.physics.incidence import angles_of_variance, spread_of_angle
 from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.surveying.flat_ground import REFERENCE_ERROR, SLOPE, predict_angles
 from wavebatch.tools.sheets.survey import ANGLES, tabulate_angles
@@ -104,3 +104,13 @@ def test_a_picture_of_angles_is_refused_before_the_survey(riegl, tmp_path, monke
     monkeypatch.setattr("wavebatch.cli.survey._survey", None)  # nothing is surveyed
     refused = run(riegl, "--divergence", 0.5, "--angles", tmp_path / "a.bmp")
     assert refused.exit_code == 2 and "a.bmp" in refused.stderr and ".svg" in refused.stderr, refused.output
+
+
+def test_what_rough_ground_adds_is_in_the_errors_of_the_table_and_of_the_prediction():
+    """Rough ground of so much variance looks like 30 degrees: all of them are the error there, and less beyond."""
+    added = float(spread_of_angle(np.radians(SLOPE), 700.0, 0.5e-3)) ** 2
+    rough = replace(GAUSSIAN, widths=replace(GAUSSIAN.widths, rough=added))
+    smooth, found = (tabulate_angles(one, 1.0, 700.0, 0.5, 1000.0).error for one in (GAUSSIAN, rough))
+    assert found[30] == pytest.approx(np.hypot(smooth[30], 30.0), rel=1e-3) and found[60] < 0.3 * found[30]
+    before, after = (predict_angles(one, 1.0, 700.0, 0.5, 1000.0).error for one in (GAUSSIAN, rough))
+    assert after == pytest.approx(np.hypot(before, 30.0), rel=1e-3)

@@ -440,6 +440,8 @@ def predict_angles(
     variance_err = np.hypot(2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR), system.widths.error or 0.0)
     given, given_err, away = (np.array([value]) for value in (added * added, variance_err, distance))
     error = float(np.degrees(angles_of_variance(given, given_err, away, 1e-3 * divergence)[1][0]))
+    smooth = np.sqrt(np.maximum(added * added - (system.widths.rough or 0.0), 0.0))
+    error = math.hypot(error, SLOPE - float(np.degrees(angle_of_spread(smooth, distance, 1e-3 * divergence))))
     flat_err = float(np.hypot(bound_time(max(amplitude, 1e-3), own, system.noise.std, spacing), system.widths.scatter))
     least = np.sqrt(np.hypot(2.0 * np.hypot(own * flat_err, own * own * REFERENCE_ERROR), system.widths.error or 0.0))
     facing = float(np.degrees(angle_of_spread(least, distance, 1e-3 * divergence)))

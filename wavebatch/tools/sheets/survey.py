@@ -332,6 +332,8 @@ def tabulate_angles(
     measured = variance[:, None] + variance_err[:, None] * normal
     angle = angle_of_spread(np.sqrt(np.maximum(measured, 0.0)), distance, beam)
     error = np.degrees(np.sqrt(np.mean((angle - np.radians(ANGLES)[:, None]) ** 2, axis=1)))
+    smooth = angle_of_spread(np.sqrt(np.maximum(spread**2 - (system.widths.rough or 0.0), 0.0)), distance, beam)
+    error = np.hypot(error, ANGLES - np.degrees(smooth))
     width = FWHM_PER_SIGMA * sigma
     return AngleTable(distance, divergence, amplitude, ANGLES, spread, width, np.where(np.isnan(sigma), np.nan, error))
 
