@@ -112,9 +112,9 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
         return noise
     s, length = block.samples.shape[1], end - start
     # Each recording is repeated up to the length of the waveform, so that quantiles stay what they are.
-    place = start[:, None] + np.arange(s) % length[:, None]
+    place = (row * s + start)[:, None] + np.arange(s, dtype=np.int32) % length.astype(np.int32)[:, None]
     std, reach = float(noise.std[0]), int(np.ceil(system.sigma_ref / block.spacing))
-    level, _, number, lowest = find_levels(block.samples[row[:, None], place].T, std, reach, limit, counted=length)
+    level, _, number, lowest = find_levels(block.samples.take(place).T, std, reach, limit, counted=length)
     level = np.where(number >= LEAST_QUIET, level, lowest + np.float32(LOWEST_TENTH * std))
     # The mean of correlated samples scatters more than that of as many independent ones.
     spread = std * np.sqrt(max(1.0, 1.0 + 2.0 * float(np.sum(system.noise.correlation))))

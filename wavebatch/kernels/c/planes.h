@@ -20,6 +20,26 @@ static void describe_sums(const double *sums, double *centre, double *covariance
     }
 }
 
+/* The value of this rank, from 0, of n values, whose order is lost (Hoare 1961). */
+static double take_ranked(int64_t n, double *values, int64_t rank) {
+    for (int64_t low = 0, high = n - 1; low < high;) {
+        const double pivot = values[rank];
+        int64_t i = low, j = high;
+        do {
+            while (values[i] < pivot) i++;
+            while (pivot < values[j]) j--;
+            if (i <= j) {
+                const double other = values[i];
+                values[i++] = values[j];
+                values[j--] = other;
+            }
+        } while (i <= j);
+        if (j < rank) low = i;
+        if (rank < i) high = j;
+    }
+    return values[rank];
+}
+
 /* Eigenvalues of a symmetric matrix, ascending, and unit eigenvectors as columns (Jacobi 1846). Last bits and signs of those of
    LAPACK depend on the processor. */
 static void find_axes(const double *matrix, double *spreads, double *axes) {

@@ -132,26 +132,6 @@ EXPORT int64_t quiet_levels(const Block *b, int64_t n, double limit, int64_t rea
     return good ? 0 : -1;
 }
 
-/* The value of this rank, from 0, of n values, whose order is lost (Hoare 1961). */
-static double take_ranked(int64_t n, double *values, int64_t rank) {
-    for (int64_t low = 0, high = n - 1; low < high;) {
-        const double pivot = values[rank];
-        int64_t i = low, j = high;
-        do {
-            while (values[i] < pivot) i++;
-            while (pivot < values[j]) j--;
-            if (i <= j) {
-                const double other = values[i];
-                values[i++] = values[j];
-                values[j--] = other;
-            }
-        } while (i <= j);
-        if (j < rank) low = i;
-        if (rank < i) high = j;
-    }
-    return values[rank];
-}
-
 typedef struct { float width, extra, strong; int64_t reach, recovery, least; } Quiet; /* as for find_levels in kernels/signal/noise.py */
 
 /* Which samples of a waveform above `level` are quiet; their mean, 0 without any, and number. */
@@ -177,17 +157,13 @@ static float mean_of_quiet(int64_t s, const float *y, float level, float busy, c
     return total / (float)(*number > 0 ? *number : 1);
 }
 
-/* Levels of n waveforms from themselves alone, their quiet samples (n, s) and, among the first `counted`, the number of these;
-   the value of the lowest tenth. */
+/* Levels of n waveforms from themselves alone, in place of first ones; their quiet samples (n, s), and the number of these among
+   the first `counted`. */
 EXPORT int64_t find_levels(int64_t n, int64_t s, const float *signal, const Quiet *q, const int64_t *counted,
-                           float *level, uint8_t *quiet, int64_t *number, float *lowest) {
+                           float *level, uint8_t *quiet, int64_t *number) {
     Rows r = {0};
-    double *ranked = malloc((s + 1) * sizeof *ranked);
-    const int good = reserve_rows(&r, s) && ranked;
+    const int good = reserve_rows(&r, s);
     for (int64_t w = 0; w < n && good; w++, signal += s, quiet += s) {
-        for (int64_t i = 0; i < s; i++) ranked[i] = signal[i];
-        level[w] = take_ranked(s, ranked, s / 4);
-        lowest[w] = take_ranked(s, ranked, s / 10);
         for (int round = 0; round < 3; round++)
             level[w] += mean_of_quiet(s, signal, level[w], q->width + (round ? 0 : q->extra), q, 0, &r, number + w);
         memcpy(quiet, r.marks, s);
@@ -203,7 +179,6 @@ EXPORT int64_t find_levels(int64_t n, int64_t s, const float *signal, const Quie
         for (int64_t i = 0; i < counted[w]; i++) number[w] += quiet[i];
     }
     free_rows(&r);
-    free(ranked);
     return good ? 0 : -1;
 }
 

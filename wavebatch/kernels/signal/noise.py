@@ -614,12 +614,13 @@ def find_levels(
     signal, (s, n) = np.ascontiguousarray(signal.T, np.float32), signal.shape
     width = np.float32(limit * SMOOTH_GAIN * std + 0.25)
     counted = np.ascontiguousarray(np.full(n, s) if counted is None else np.minimum(counted, s), np.int64)
-    level, lowest = np.empty((2, n), np.float32)
-    found = OwnLevels(level, np.empty((n, s), np.bool_), np.empty(n, np.int64), lowest)
+    ordered = np.sort(signal, axis=1)
+    level, lowest = (ordered[:, s // part].copy() if s else np.zeros(n, np.float32) for part in (4, 10))
+    quiet, number = np.empty((n, s), np.bool_), np.zeros(n, np.int64)
+    rules = CQuiet(width, std, width * np.float32(STRONG), reach, recovery, LEAST_BEFORE)
     if signal.size:
-        rules = CQuiet(width, std, width * np.float32(STRONG), reach, recovery, LEAST_BEFORE)
-        call("find_levels", *map(ctypes.c_int64, (n, s)), signal, rules, counted, *found)
-    return found._replace(quiet=found.quiet.T)
+        call("find_levels", *map(ctypes.c_int64, (n, s)), signal, rules, counted, level, quiet, number)
+    return OwnLevels(level, quiet.T, number, lowest)
 
 
 def keep_longest(missing: np.ndarray) -> np.ndarray:
