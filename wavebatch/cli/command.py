@@ -19,7 +19,7 @@ import math
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -269,24 +269,33 @@ def complete(kind: str) -> Callable[[click.Context, click.Parameter, str], list[
     """
 
     def offer(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-        from wavebatch.core.echoes import COLUMNS, EchoFlag
-        from wavebatch.stages.chain import STAGES, list_profiles, load_plugins
-        from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES
-
         before, comma, last = incomplete.rpartition(",") if kind in ("flags", "written") else ("", "", incomplete)
         last = last.upper() if kind == "flags" else last
         given = {part.upper().lstrip("+") for part in before.split(",")}
-        ours = [name for name, column in COLUMNS.items() if column.extra_bytes]
-        if kind == "stages":
+        # Only what a kind needs is imported: the user waits.
+        names: Iterable[str]
+        if kind == "chains":
+            from wavebatch.stages.chain import list_profiles
+
+            names = ("auto", *list_profiles())
+        elif kind == "stages":
+            from wavebatch.stages.chain import STAGES, load_plugins
+
             load_plugins()
-        names = {
-            "chains": ("auto", *list_profiles()),
-            "flags": [flag.name or "" for flag in EchoFlag],
-            "written": [f"+{name}" for name in ours] if last.startswith("+") else ours,
-            "columns": list(dict.fromkeys([*ours, *_FIELDS])),
-            "stages": sorted(STAGES),
-            "scenes": (*SCENES, *OTHER_NAMES),
-        }[kind]
+            names = sorted(STAGES)
+        elif kind == "scenes":
+            from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES
+
+            names = (*SCENES, *OTHER_NAMES)
+        else:
+            from wavebatch.core.echoes import COLUMNS, EchoFlag
+
+            ours = [name for name, column in COLUMNS.items() if column.extra_bytes]
+            names = {
+                "flags": [flag.name or "" for flag in EchoFlag],
+                "written": [f"+{name}" for name in ours] if last.startswith("+") else ours,
+                "columns": list(dict.fromkeys([*ours, *_FIELDS])),
+            }[kind]
         fitting = (name for name in names if name.startswith(last) and name.upper().lstrip("+") not in given)
         return [f"{before}{comma}{name}" for name in fitting]
 
