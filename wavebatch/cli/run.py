@@ -11,6 +11,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -267,7 +268,7 @@ def run(**options: Any) -> None:
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     from wavebatch.batch.run import run_batch
 
-    level = -1 if options["quiet"] else int(options["verbose"])
+    level, is_new = -1 if options["quiet"] else int(options["verbose"]), not os.path.exists(batch_options.folder)
     with Progress([job.path for job in jobs], options["progress"], level, options["debug"]) as progress:
         result = run_batch(jobs, batch_options, progress.show)
     if level > 0:
@@ -280,6 +281,9 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
     code = find_exit_code([outcome.error for outcome in result.outcomes])
+    if code == messages.EXIT_USAGE and is_new:  # wrong usage leaves nothing
+        with suppress(OSError):
+            batch_options.folder.rmdir()
     # Strips that --resume skipped have their warnings too.
     codes = set(options["fail_on"] or ())
     warned = [one.job.path for one in result.outcomes if {w.code for w in one.report.warnings} & codes]
