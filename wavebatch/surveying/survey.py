@@ -49,7 +49,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_empty,
     thin_samples,
 )
-from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, measure_residuals
+from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, guess_growth, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
@@ -220,12 +220,18 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
     return block, replace(measure_whole(block, begin, cleaned=True), defects=found.defects)
 
 
-def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
-    """As survey_block, from noise and width by `clean_sample`; once more where noise grows with the signal."""
+def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: bool | None = None) -> Survey:
+    """As survey_block, from noise and width by `clean_sample`; once more where noise grows with the signal.
+
+    guessed: whether the growth of noise in `system` is a guess, or False where fits showed it; None before both.
+    """
     first, figures, repeated, lowered = system, Figures(), [], 0.0
     candidates: tuple[Tried, ...] = ()
     if learn:
         clear = find_clear(block, system)
+        growth = guess_growth(block, system, clear) if guessed is None else 0.0
+        if growth > 0:
+            return _survey(block, measure_again(block, first, growth), learn=learn, guessed=True)
         main = find_isolated(block, system, clear)
         figures.isolated_echoes = len(main)
         starts = {"gaussian": system}
@@ -254,8 +260,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         borne = bear(system, choice.best.change)
         echoes = decompose_sample(part, borne)
         system = measure_residuals(part, system, echoes)
-        if system.noise.gain > 0 and not first.noise.gain:
-            return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
+        if guessed or (guessed is None and system.noise.gain > 0):
+            return _survey(block, measure_again(block, first, system.noise.gain), learn=learn, guessed=False)
         noise, looked = lower_noise(part, replace(borne, noise=system.noise))
         if noise is not system.noise:
             lowered = system.noise.std

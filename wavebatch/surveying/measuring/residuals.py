@@ -51,6 +51,16 @@ BROUGHT, BROUGHT_CROSS = np.sqrt(2 / 3) * np.array([1, 2 / 3, 1 / 2]), -np.sqrt(
 """Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first
 and the third one, times 2 / sqrt(2) as it enters the sum."""
 
+FINE = np.array([70, -56, 28, -8, 1]) / np.sqrt(12_870)
+"""Half of a filter that takes eighth differences, and leaves white noise as large as it is."""
+
+MANIFOLD = 20.0
+"""Variance that strong echoes add, over that of noise without signal, from which fits by white noise split nearly all
+of them, so that those that stay single do not show it."""
+
+ENOUGH_TO_GROW, ENOUGH_FINE = 2000, 500
+"""Samples in which a growth is looked for, and in which one of MANIFOLD shows."""
+
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
 fits leave at no signal."""
@@ -192,8 +202,29 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
         kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
         std = max(std, kinds["weak_echoes"])
     sample = kinds.get("outside") or kinds["quiet"] or std
-    gain = _noise_gain(residual, model, lag, width, std, std > COLOURED * sample)
+    coloured = std > COLOURED * sample
+    steep = bool(2 * system.noise.gain * quantile(alone.amplitude, 0.9) > MANIFOLD * std**2) and not coloured
+    gain = _noise_gain(residual, model, lag, width, std, coloured, steep=steep)
     return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=gain))
+
+
+def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
+    """The growth of the noise per count of signal before a pulse is known, from Gaussians fitted to lone echoes (m,).
+
+    0 where it is less than MANIFOLD: then fits of the pulse show it. Pulses, close pairs and what Gaussians miss of
+    them are smooth, photons are not: in eighth differences only noise is left, if it is not coloured (H12).
+    """
+    noise = system.noise
+    if len(echoes) < FEW or system.sigma_ref < block.spacing or noise.std > COLOURED * noise.quiet:
+        return 0.0
+    part, rows = block.rows(echoes.waveform), np.arange(len(echoes), dtype=np.int32)
+    model = render_own(part, system, echoes, rows, len(rows))
+    residual = np.nan_to_num(subtract_echoes(part, system, replace(echoes, waveform=rows), model))
+    fine, signal = (filter_symmetric(one.T, taps).T for one, taps in ((residual, FINE), (model, FINE**2)))
+    lag = (np.arange(model.shape[1]) - echoes.time[:, None] / block.spacing) / (echoes.sigma[:, None] / block.spacing)
+    # Of an endless width: the fit takes away nothing of such differences.
+    gain = _noise_gain(fine, signal, lag, np.full(len(rows), np.inf), noise.quiet, False, steep=True)
+    return gain if gain * quantile(echoes.amplitude, 0.9) > MANIFOLD * noise.quiet**2 else 0.0
 
 
 def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
@@ -329,9 +360,10 @@ def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...])
 
 
 def _noise_gain(
-    residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool
+    residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool,
+    *, steep: bool,
 ) -> float:
-    """Growth of the variance per count of signal, 0 where it could be chance (H12)."""
+    """Growth of the variance per count of signal, 0 where it could be chance (H12); steep: if it is one of MANIFOLD."""
     core = np.abs(lag) < GROWTH_REACH
     # Share h of a sample's variance that the fit of amplitude, time and width takes away, and what it brings there of a
     # variance that is the pulse itself, of height 1: the sum of h_ij^2 S_j over the samples j.
@@ -353,13 +385,15 @@ def _noise_gain(
     squared = ((values - common) * np.sqrt(number / np.maximum(number - 1, 1))) ** 2 / (1 - taken)
     # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
     signal = (model[core].astype(np.float64) * (1 - 2 * taken) + height * brought) / (1 - taken)
-    if len(signal) < 2000:
+    if len(signal) < (ENOUGH_FINE if steep else ENOUGH_TO_GROW):
         return 0.0
     edges = quantiles(signal, np.linspace(0, 1, 13))
     place = np.clip(np.searchsorted(edges, signal) - 1, 0, 11)
     filled = [i for i in range(12) if (place == i).any()]
     level = np.array([median(signal[place == i]) for i in filled])
     variance = np.array([median(squared[place == i]) for i in filled]) * MAD_TO_STD**2
+    if steep:  # noise without signal is one more level: how coloured it is hardly counts
+        level, variance = np.r_[0.0, level], np.r_[std**2, variance]
     # A pulse that misses its echoes leaves what grows with the square of the signal: only the linear part is noise.
     scale = np.hypot(variance, std**2)
     terms = np.stack([np.ones_like(level), level, level * level], axis=1) / scale[:, None]
