@@ -62,6 +62,11 @@ LARGER = 1.5
 """Standard errors by which what most echoes have more of is a larger share of weaker ones: chance takes one lag of
 fifteen from a tail, whose others stay. Else SURE."""
 
+EVEN, FAINT, ALIKE = 1.5, 0.01, 0.1
+"""How much further above the median a sixth of the echoes may lie than a sixth lies below it (of neighbours, whose
+shares are exponential, 2.2 times), and the largest share there, where a ringing moves from shot to shot: leaves in most
+waveforms return more. And part of itself by which a tail may be larger on weaker echoes: targets widen some."""
+
 ENOUGH_FOR_TAIL = 8
 """Strong echoes that show a tail beyond chance: where three in ten have a neighbour at some lag, all of so many do once
 in 15,000 lags."""
@@ -196,39 +201,42 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
     strong, weaker = part_strong(clear)
     if len(strong) < ENOUGH_FOR_TAIL:
         return system
-    left, others, parts, flanks = ResidualShares(block, system, strong), None, {}, {}
-    for place in range(-TAIL_BEFORE, TAIL_AFTER):
-        if abs(place) < 3 or (seen := left.look(place)).number < ENOUGH_FOR_TAIL:
+    left, parts = ResidualShares(block, system, strong), {}
+    others = ResidualShares(block, system, weaker) if len(weaker) >= ENOUGH_FOR_TAIL else None
+    for half in range(-2 * TAIL_BEFORE, 2 * TAIL_AFTER):
+        seen = left.look(half / 2)
+        if abs(half) < 6 or seen.number < ENOUGH_FOR_TAIL:
             continue
         # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
         scatter = 2 * np.sqrt(seen.spread**2 - left.noise**2)
-        share, chance = abs(seen.common) + scatter, SURE / np.sqrt(seen.number)
-        is_part = abs(seen.common) > max(CONSTANT * scatter, SURE * seen.error)
+        share, sure = abs(seen.common) + scatter, abs(seen.common) > SURE * seen.error
+        is_part = sure and abs(seen.common) > CONSTANT * scatter
         higher, all_have = seen.median > seen.common + seen.spread, False
         if not higher:
             # A tail that changes from shot to shot scatters, but hardly any echo is without it, as without a neighbour.
-            all_have = NORMAL_BELOW[0] * seen.number > 1 and seen.lowest > LOWEST_ERROR * left.noise * chance
-            is_part |= all_have
-        if is_part and len(weaker) >= ENOUGH_FOR_TAIL:
+            all_have = NORMAL_BELOW[0] * seen.number > 1
+            all_have &= seen.lowest > LOWEST_ERROR * left.noise * SURE / np.sqrt(seen.number)
+            # Or it moves, so that some are without it: it is faint then, and as often lower than higher.
+            below, above = seen.median - seen.common + seen.spread, seen.high - seen.median
+            moves = sure and abs(seen.median) > SURE * seen.error and above < EVEN * below and seen.high < FAINT
+            if moves and not (is_part or all_have):
+                share = abs(seen.median) + 2 * np.sqrt(max((above + below) ** 2 / 4 - left.noise**2, 0.0))
+            is_part |= all_have or moves
+        if is_part and others:
             # A tail is the same share of weaker echoes, neighbours are a larger one.
-            others = others or ResidualShares(block, system, weaker)
-            other = others.look(place)
+            other = others.look(half / 2)
             more = np.sign(seen.common) * other.common - abs(seen.common)
-            is_part = more <= (SURE if all_have else LARGER) * np.hypot(seen.error, other.error)
-            is_part &= other.number >= ENOUGH_FOR_TAIL or not higher
+            chance = (SURE if all_have else LARGER) * np.hypot(seen.error, other.error) + ALIKE * abs(seen.common)
+            is_part = more <= chance and (not higher or (-more <= chance and other.number >= ENOUGH_FOR_TAIL))
         elif higher:  # most echoes have a neighbour there, perhaps all of them
             is_part = False
         # Higher ones are targets: rows of crops, and roofs over the ground, have one distance.
-        if PART > share > min(LEAST_TAIL, 2 * left.noise):
-            if is_part:
-                parts[place] = share
-            elif not higher and seen.common > SURE * seen.error:
-                flanks[place] = share
-    # A part that moves from shot to shot is in some waveforms only beside its place.
-    for place in flanks.keys() & {beside for part in parts for beside in (part - 1, part + 1)}:
-        flanks[place] = max(flanks[place], parts.get(place - 1, 0.0), parts.get(place + 1, 0.0))
-        parts[place] = flanks[place]
-    profile = ((float(place * system.sigma_ref), float(share)) for place, share in sorted(parts.items()))
+        if is_part and PART > share > min(LEAST_TAIL, 2 * left.noise):
+            parts[half] = share
+    # A ringing is higher between two steps than at them.
+    highest = {place: max(parts.get(2 * place + beside, 0.0) for beside in (-1, 0, 1))
+               for place in range(-TAIL_BEFORE, TAIL_AFTER) if abs(place) >= 3}  # fmt: skip
+    profile = ((float(place * system.sigma_ref), float(share)) for place, share in highest.items() if share)
     return replace(system, tail_misfit=tuple(profile))
 
 
@@ -305,6 +313,8 @@ class Seen(NamedTuple):
     common: float
     """The mean of the lower half of them, as normal values have it."""
     median: float
+    high: float
+    """What a sixth of them exceed."""
     spread: float
     """Standard deviation, that of noise at least."""
 
@@ -334,7 +344,7 @@ class ResidualShares:
         self.share = np.where(np.isfinite(residual), share / fitted.amplitude[:, None], np.nan)
         self.noise = float(system.noise.std / median(fitted.amplitude) / np.sqrt(energy))
 
-    def look(self, place: int) -> Seen:
+    def look(self, place: float) -> Seen:
         """What is left at this lag [widths of the pulse]: between samples, so that a part's slope is no scatter."""
         at = self.time + place * self.step
         row = np.flatnonzero((at >= 0) & (at < self.share.shape[1] - 1))
@@ -344,10 +354,10 @@ class ResidualShares:
         here = here[np.isfinite(here)]
         number = len(here)
         if not number:
-            return Seen(1, 0.0, 0.0, 0.0, np.inf)
-        lowest, low = quantiles(here, NORMAL_BELOW)
+            return Seen(1, 0.0, 0.0, 0.0, 0.0, np.inf)
+        lowest, low, high = quantiles(here, (*NORMAL_BELOW, 1 - NORMAL_BELOW[1]))
         spread = max(low - lowest, self.noise)
-        return Seen(number, lowest, low + spread, median(here), spread)
+        return Seen(number, lowest, low + spread, median(here), high, spread)
 
 
 def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
