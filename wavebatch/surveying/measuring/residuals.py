@@ -26,7 +26,7 @@ from wavebatch.stages.detect.direct import matched_filter
 from wavebatch.stages.flags import use_noise_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, floor_level, model_parameters, pulse_shape, shape_limits
-from wavebatch.surveying.measuring.noise_and_width import DITHERED, ENOUGH_TO_LEARN, FEW, UNDITHERED
+from wavebatch.surveying.measuring.noise_and_width import DITHERED, ENOUGH_TO_LEARN, FEW, UNDITHERED, spread_rows
 
 WEAK = 60.0
 """Amplitude, over DITHERED, up to which the misfit of a learned pulse is less than rounding."""
@@ -58,8 +58,8 @@ MANIFOLD = 20.0
 """Variance that strong echoes add, over that of noise without signal, from which fits by white noise split nearly all
 of them, so that those that stay single do not show it."""
 
-ENOUGH_TO_GROW, ENOUGH_FINE = 2000, 500
-"""Samples in which a growth is looked for, and in which one of MANIFOLD shows."""
+ENOUGH_TO_GROW, ENOUGH_FINE, MOST_FINE = 2000, 500, 1024
+"""Samples in which a growth is looked for, and in which one of MANIFOLD shows; and echoes that are asked for it."""
 
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
@@ -217,6 +217,7 @@ def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     noise = system.noise
     if len(echoes) < FEW or system.sigma_ref < block.spacing or noise.std > COLOURED * noise.quiet:
         return 0.0
+    echoes = echoes.take(spread_rows(len(echoes), MOST_FINE))
     part, rows = block.rows(echoes.waveform), np.arange(len(echoes), dtype=np.int32)
     model = render_own(part, system, echoes, rows, len(rows))
     residual = np.nan_to_num(subtract_echoes(part, system, replace(echoes, waveform=rows), model))
