@@ -49,20 +49,24 @@ def test_baselines_are_those_of_a_loop(rng, recovery, gaps):
 
 @pytest.mark.parametrize("gaps", [False, True])
 def test_a_level_far_from_the_strips_is_seen_where_a_waveform_is_flat(rng, gaps):
-    """One waveform 4 DN above levels that scatter by .5: no sample of it is quiet by the strip's. One full of echoes is
-    not flat, and keeps the strip's level."""
+    """One waveform 4 DN above levels that scatter by .5: no sample of it is quiet by the strip's. One full of echoes, and
+    one full of a clipped one, keep the strip's level; so does one that is flat in its first 85 samples, of 200 but not of
+    150 that were recorded."""
     x = np.arange(200.0)
     samples = 12 + 1.1 * rng.standard_normal((50, 200))
-    samples[7] += 4
+    samples[[7, 9]] += 4
     samples[8] += 30 + 20 * np.sin(x / 4)
+    samples[9, 85:] += 30 + 20 * np.sin(x[85:] / 4)
+    samples[10, 4:] = 255
     missing = np.zeros(samples.shape, bool)
     missing[:, 150:] = gaps
     block = WaveformBlock.from_samples(np.rint(samples).astype(np.uint8))
     block = replace(block, missing=missing) if gaps else block
     baseline = STAGES["noise.pooled"].function(block, SYSTEM).baseline
     assert baseline[7] == pytest.approx(16, abs=0.3)
-    assert baseline[8] == 12
-    assert np.delete(baseline, [7, 8]) == pytest.approx(np.full(48, 12), abs=0.5)
+    assert baseline[9] == (pytest.approx(16, abs=0.3) if gaps else 12)
+    assert baseline[[8, 10]] == pytest.approx([12, 12], abs=0.5)
+    assert np.delete(baseline, [7, 8, 9, 10]) == pytest.approx(np.full(46, 12), abs=0.5)
 
 
 @pytest.mark.parametrize("gaps", [False, True])

@@ -84,13 +84,15 @@ def test_a_tail_stays_in_the_pulse_of_a_canopy():
     assert len(system.components) > 1
 
 
-@pytest.mark.parametrize("is_tail", [True, False])
-def test_a_layer_below_every_echo_is_no_tail(is_tail):
-    """Each echo has a part 5 widths later: of a twentieth of it, or as high as leaves are, whatever they lie below."""
+@pytest.mark.parametrize("kind", ["tail", "layer", "leaves"])
+def test_a_layer_below_every_echo_is_no_tail(kind):
+    """Each echo has a part 5 widths later: of a twentieth of it, as high as leaves are, whatever they lie below, or of 2 %
+    that scatters as leaves do, as often lower as higher."""
     rng = np.random.default_rng(5)
     n, width, x = 1500, 2.0, np.arange(80.0)
     height, time = np.exp(rng.uniform(np.log(60), np.log(200), n)), rng.uniform(24, 44, n)
-    part = 0.05 * height if is_tail else np.exp(rng.uniform(np.log(4), np.log(12), n))
+    part = {"tail": 0.05 * height, "layer": np.exp(rng.uniform(np.log(4), np.log(12), n)),
+            "leaves": np.maximum(0.02 + 0.012 * rng.standard_normal(n), 0) * height}[kind]  # fmt: skip
     signal = sum(
         one[:, None] * np.exp(-0.5 * ((x - at[:, None]) / width) ** 2)
         for one, at in ((height, time), (part, time + width * rng.uniform(4.8, 5.2, n)))
@@ -98,7 +100,7 @@ def test_a_layer_below_every_echo_is_no_tail(is_tail):
     block = WaveformBlock.from_samples(np.rint(12 + signal + rng.standard_normal((n, 80))).astype(np.uint8))
     system = SystemPulse(sigma_ref=width, noise=ReceiverNoise(baseline=12.0, std=1.0))
     tail = measure_tail(block, system, find_clear(block, system)).tail_misfit
-    assert dict(tail).get(5 * width, 0.0) == (pytest.approx(0.05, rel=0.1) if is_tail else 0.0)
+    assert dict(tail).get(5 * width, 0.0) == (pytest.approx(0.05, rel=0.1) if kind == "tail" else 0.0)
 
 
 def test_a_ringing_that_moves_between_steps_is_a_tail():

@@ -17,6 +17,7 @@ from wavebatch.kernels.signal.noise import DRIFT, MOST_CUT, MOST_LEAST, find_lev
 from wavebatch.kernels.signal.runs import find_stretches, list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, quiet_mean, sum_samples, transpose_samples
 from wavebatch.stages.chain import Range, stage
+from wavebatch.stages.pulse_tables import clip_level
 
 LEAST_QUIET, LOWEST_TENTH = 6, 1.28
 """Quiet samples from which they give the level of a recording; how far, in standard deviations, the lowest tenth of
@@ -87,9 +88,9 @@ def pooled(
             lowest += np.float32(LOWEST_TENTH * std)
             mean, number = np.where(seen > 0, above, lowest), np.maximum(seen, 1)
         else:
-            # However far its level is from the strip's: echoes do not make most of a waveform flat.
+            # However far its level is from the strip's: echoes do not make most of a waveform flat, unless clipped.
             recorded = len(signal) if block.missing is None else (~block.missing[own]).sum(axis=1)
-            flat = 2 * seen > recorded
+            flat = (2 * seen > recorded) & (above + std < clip_level(block, system) - system.noise.baseline)
             mean[own[flat]], number[own[flat]] = above[flat], seen[flat]
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.noise.baseline + trust * mean
