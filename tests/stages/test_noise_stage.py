@@ -49,9 +49,9 @@ def test_baselines_are_those_of_a_loop(rng, recovery, gaps):
 
 @pytest.mark.parametrize("gaps", [False, True])
 def test_a_level_far_from_the_strips_is_seen_where_a_waveform_is_flat(rng, gaps):
-    """One waveform 4 DN above levels that scatter by .5: no sample of it is quiet by the strip's. One full of echoes, and
-    one full of a clipped one, keep the strip's level; so does one that is flat in its first 85 samples, of 200 but not of
-    150 that were recorded."""
+    """One waveform 4 DN above levels that scatter by .5: no sample of it is quiet by the strip's. One full of echoes,
+    and one full of a clipped one, keep the strip's level; so does one that is flat in its first 85 samples, of 200 but
+    not of 150 that were recorded."""
     x = np.arange(200.0)
     samples = 12 + 1.1 * rng.standard_normal((50, 200))
     samples[[7, 9]] += 4
