@@ -86,8 +86,8 @@ def test_a_tail_stays_in_the_pulse_of_a_canopy():
 
 @pytest.mark.parametrize("kind", ["tail", "layer", "leaves"])
 def test_a_layer_below_every_echo_is_no_tail(kind):
-    """Each echo has a part 5 widths later: of a twentieth of it, as high as leaves are, whatever they lie below, or of 2 %
-    that scatters as leaves do, as often lower as higher."""
+    """Each echo has a part 5 widths later: of a twentieth of it, as high as leaves are, whatever they lie below, or of
+    2 % that scatters as leaves do, as often lower as higher."""
     rng = np.random.default_rng(5)
     n, width, x = 1500, 2.0, np.arange(80.0)
     height, time = np.exp(rng.uniform(np.log(60), np.log(200), n)), rng.uniform(24, 44, n)
