@@ -146,7 +146,7 @@ def test_the_lines_are_found():
 
 SNIPPETS = {
     page: re.findall(r"(?ms)^```python\n(.*?)^```$", (ROOT / page).read_text("utf-8"))
-    for page in ("README.md", "docs/index.md", "docs/data.md")
+    for page in ("README.md", "docs/data.md")
 }
 
 

@@ -279,11 +279,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_again(part, system, borne, echoes)
-        # From here on the misfit alone is raised, and twice it is left beside strong echoes: four times, as for that of
-        # the description, lost one clear echo in forty in canopies.
+        # From here on the misfit alone is raised: `faint_share` stays as the description's misfit asks for.
         misfit, left = cover_fits(system, echoes, block.spacing)
         if misfit > system.misfit:
-            system = replace(system, misfit=misfit, faint_share=max(system.faint_share, min(2 * misfit, MOST_FAINT)))
+            system = replace(system, misfit=misfit)
             echoes = decompose_sample(part, system)
         # Neither the description nor what fits leave shows a shape that changes, where two echoes describe it as well.
         if choice.best.change and suspect_pairs(echoes, system.sigma_ref):
