@@ -388,6 +388,25 @@ def test_vectors_that_are_wrong_in_a_stretch_give_no_angle_there(tmp_path, edit_
     assert off.max() < 0.6 and np.sum(off > error[known]) < 10
 
 
+@pytest.mark.parametrize("change", ["off by less than rays miss the path", "path not known"])
+def test_vectors_that_nothing_contradicts_keep_their_angles(tmp_path, edit_points, change):
+    """Beside a gap in time, where the path is not known, good vectors lost their angles."""
+    flight, part = Sensor(rate=10_000.0, n_samples=40, line_rate=100.0, heading=60.0, speed=33.0), slice(11_880, None)
+    write_strip(tmp_path / "a.las", [Facet(0.3, slope=(0.1, -0.05))], flight, 12_000)
+
+    def spoil(points):
+        if change == "path not known":
+            points["gps_time"][part] += 3.0
+        else:
+            points["x_t"][part] += 0.006 * points["z_t"][part]
+
+    strip = edit_points(tmp_path / "a.las", tmp_path / "b.las", spoil)
+    succeed("run", strip, "-o", tmp_path / "out", "--profile", "fast", "--columns", "range,incidence_angle_normals")
+    found = wb.read_cloud(tmp_path / "out" / "b.laz")
+    assert np.isnan(found["range"][part]).any() == (change == "path not known")
+    assert np.isfinite(found["incidence_angle_normals"][part]).mean() > 0.9
+
+
 @pytest.mark.parametrize("turns", [0, 2, 4])
 @pytest.mark.parametrize(("apart", "meets"), [((0, 0, 0), True), ((30, 0, 0), False), ((0, 0, 150), False)])
 def test_rays_of_two_sensors_with_the_same_times_do_not_meet(monkeypatch, tmp_path, apart, meets, turns):

@@ -210,11 +210,12 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
     sensor = prepared.sensor
     if sensor.kind == "direction vectors" and sensor.distance is not None:
         # The vectors of most pulses meet in the path. Those of a stretch that do not are no directions of its rays.
+        # Where the path is not known, nothing speaks against them.
         most = (LARGEST_MISS + np.radians(sensor.turned)) * sensor.distance
         for index, (block, *_) in solved:
             if block.sensor is not None:
                 miss = np.square(np.cross(block.origin - block.sensor, unit[index])).sum(axis=1)
-                unit[index[~(miss < most * most)]] = np.nan
+                unit[index[miss > most * most]] = np.nan
     ray = unit[echoes.table.waveform]
     entries["ray"] = np.append(ray, np.full((1, 3), np.nan, np.float32), axis=0)[made.echo]
     return (entries, state), RunReport(timing=timing)
