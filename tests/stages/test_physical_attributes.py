@@ -573,6 +573,20 @@ def test_vectors_of_a_wrong_length_are_in_the_errors_of_echoes_far_from_returns(
     assert error == pytest.approx([ERROR * length, np.hypot(ERROR * length, missed)], rel=1e-3)
 
 
+@pytest.mark.parametrize("lone", [0, 1])
+def test_a_packet_without_a_return_takes_no_other_packets_time(lone):
+    """Its place counts from its origin: so does the error of a vector of a wrong length."""
+    block = WaveformBlock.from_samples(np.zeros((2, 80), np.uint8))
+    returns = ReturnTable(np.array([1 - lone], np.int32), np.array([20.0]), np.zeros(1, int), block.origin[:1])
+    block = replace(block, returns=returns, direction=np.array([[1.03 * HALF_C, 0.0, 0.0]] * 2))
+    echoes = EchoTable.build(np.arange(2.0), np.full(2, 20.0), np.full(2, 50.0), np.full(2, 2.0),
+                             time_err=np.full(2, ERROR))  # fmt: skip
+    done = position(block, Noise(np.zeros(2, "f4"), np.ones(2, "f4")), SystemPulse(2.0).with_radiometry(), echoes)
+    error = done.attributes["range_err"] / HALF_C
+    assert error[lone] == pytest.approx(np.hypot(ERROR * 1.03, 20.0 * 0.0303), rel=1e-3)
+    assert error[1 - lone] == pytest.approx(ERROR * 1.03, rel=1e-3)
+
+
 SYSTEMS = {
     "gaussian": SystemPulse(2.0),
     "learned": SystemPulse(2.0, components=((1.0, 0.0, 2.0), (0.1, 5.0, 2.2))),

@@ -240,7 +240,8 @@ def position(
     missed, wrong = np.zeros(len(echoes)), np.maximum(np.abs(speed - HALF_C), np.abs(speed - AIR_SPEED))
     if returns is not None and len(returns) and wrong.max(initial=0.0) > LEAST_WRONG * HALF_C:
         first = np.searchsorted(returns.waveform, waveform).clip(max=len(returns) - 1)
-        missed = np.abs(along - returns.time[first]) * np.where(wrong > LEAST_WRONG * HALF_C, wrong, 0.0)[waveform]
+        start = np.where(returns.waveform[first] == waveform, returns.time[first], 0.0)  # without a return: the origin
+        missed = np.abs(along - start) * np.where(wrong > LEAST_WRONG * HALF_C, wrong, 0.0)[waveform]
     phase, shift = system.radiometry.phase, np.abs(offset) * speed
     # An offset far beyond those of lone echoes is no phase: the return is of two surfaces, or of another one.
     shift = np.where((phase > 0) & (shift > STRANGE_SHIFT * phase), shift, 0.0)
