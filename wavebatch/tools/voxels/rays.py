@@ -277,7 +277,7 @@ class Floor(CellMap):
         super().__init__(middle, CELL, highest=False, most=most)
         self._slope = np.empty((0, 2))
         self.steep = 0.0
-        """Rise per metre that 84 % of the planes do not exceed."""
+        """Rise per metre that half of the planes exceed: roofs, where they are the lowest returns, are fewer."""
 
     def finish(self) -> Floor:
         """Fits the planes; returns the map."""
@@ -291,7 +291,7 @@ class Floor(CellMap):
         up = np.where(usable, normal[:, 2], 1.0)[:, None]
         self._slope = np.where(usable[:, None], -normal[:, :2] / up, 0.0)
         if usable.any():
-            self.steep = quantile(np.hypot(*self._slope[usable].T), 0.84)
+            self.steep = quantile(np.hypot(*self._slope[usable].T), 0.5)
         # The plane, not the lowest return itself: that may lie below the ground.
         base = planes.centre[:, 2] - (self._slope * planes.centre[:, :2]).sum(axis=1)
         self._kept[:, 2] += np.where(usable, base, 0.0)
