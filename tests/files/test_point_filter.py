@@ -1,13 +1,14 @@
 """PointFilter: every point that is left out counts for the first test that it does not meet."""
 
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from commands import refuses
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.point_filter import EVERY, REASONS, PointFilter
+from wavebatch.files.cloud.point_filter import EVERY, REASONS, PointFilter, check_bbox
 from wavebatch.files.geojson import Polygon, find_inside
 
 ROWS = {
@@ -93,6 +94,26 @@ def test_columns_that_are_missing_are_named():
 )
 def test_wrong_options_are_refused(options, words):
     refuses(ConfigError, words, PointFilter.build, **options)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "bbox", "words"),
+    [
+        ((5e5, 500900), (5400200, 5400300), (500100, 500900, 5400200, 5400300), "give 500100,5400200,500900,5400300"),
+        ((9.0, 9.1), (48.7, 48.8), (9.02, 9.05, 48.7, 48.75), "give 9.02,48.7,9.05,48.75"),
+        ((0, 2.4), (200, 426), (1, 1, 300, 410), None),
+        ((0, 20), (50, 900), (10, 10, 400, 600), None),
+        ((0, 20), (50, 900), (5, 10, 400, 600), None),
+        ((0, 10), (200, 210), (5, 5, 205, 207), None),
+        ((0, 10), (200, 210), (5, 7, 205, 205), None),
+    ],
+)
+def test_a_box_in_another_order_is_told_from_a_large_one(x, y, bbox, words):
+    extent = SimpleNamespace(mins=(x[0], y[0], 0), maxs=(x[1], y[1], 0))
+    if words is None:
+        assert check_bbox(bbox, "a.las", extent) is None
+    else:
+        refuses(ConfigError, words, check_bbox, bbox, "a.las", extent)
 
 
 def test_a_filter_travels_between_processes():

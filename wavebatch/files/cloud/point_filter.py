@@ -162,15 +162,17 @@ def check_bbox(bbox: Sequence[float], path: Path, header: LasHeader) -> None:
     """Raise ConfigError for a box in the order west, east, south, north, where x and y of a strip tell it from ours.
 
     Such a box is large and holds any part of the strip. It is known by numbers beyond x and y of the strip, the second
-    nearer to x, the third nearer to y.
+    nearer to x, the third nearer to y. In local coordinates, whose x and y are not far apart, a correct box looks so.
     """
     west, south, east, north = bbox
     (left, low, _), (right, high, _) = header.mins, header.maxs
-    is_apart = right < low or high < left
+    is_apart = low - right >= 10.0 * max(right - left, high - low)  # x above y would be a box with east below west
+    has_width = west < south and east < north  # in our order
     is_whole = west <= left and right <= east and south <= low and high <= north
     would_meet = west <= right and south >= left and east <= high and north >= low
     x, y = 0.5 * (left + right), 0.5 * (low + high)
-    if is_apart and not is_whole and would_meet and abs(south - x) < abs(south - y) and abs(east - y) < abs(east - x):
+    is_likely = is_apart and has_width and would_meet and not is_whole
+    if is_likely and abs(south - x) < abs(south - y) and abs(east - y) < abs(east - x):
         raise ConfigError(
             f"{path}: --bbox: the order must be west, south, east, north; the strip has x {left:.10g} to {right:.10g}, "
             f"y {low:.10g} to {high:.10g}; give {west:.15g},{east:.15g},{south:.15g},{north:.15g}"
