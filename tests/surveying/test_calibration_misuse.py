@@ -19,7 +19,7 @@ from tests.footprints import Flight, Plane
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.strip.reader import PairScale, StripReader
-from wavebatch.kernels.physics.radiometry import judge_energies
+from wavebatch.kernels.physics.radiometry import attenuation_of_visibility, judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration, parse_calibration
@@ -28,6 +28,7 @@ from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripC
 from wavebatch.surveying.matching import setting, strip_match
 from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_alike
 from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
+from wavebatch.tools.api import plan_run
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -822,6 +823,12 @@ def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):
          calibrated / "t.csv", "-o", tmp_path / "c.toml", "--attenuation", 22)  # fmt: skip
     fail(2, "is it per metre?", "calibrate", calibrated / "a.las", "--targets", calibrated / "t.csv", "-o",
          tmp_path / "c.toml", "--attenuation", 0.0003)  # fmt: skip
+    # Nobody gave the attenuation of a visibility, which has its own limits.
+    for number, wavelength in ((1, 532), (400, 1550)):
+        air = {"visibility": number, "wavelength": wavelength}
+        options = wb.RunOptions(output=str(tmp_path), columns="+amplitude_normalized", **air)
+        jobs, _ = plan_run([calibrated / "a.las"], options)
+        assert jobs[0].attenuation[0] == pytest.approx(attenuation_of_visibility(number, wavelength))
 
 
 def test_an_incidence_that_contradicts_the_plane_of_the_target_is_refused(tmp_path, calibrated):

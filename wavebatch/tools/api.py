@@ -169,8 +169,9 @@ def plan_run(
     air, attenuation = None, options.attenuation
     if options.visibility is not None:
         attenuation = attenuation_of_visibility(options.visibility, options.wavelength or 1064.0)
-    if attenuation is not None:
+    elif attenuation is not None:
         check_attenuation(attenuation)
+    if attenuation is not None:
         air = (float(attenuation), float(options.attenuation_error or 0.0))  # [dB/km] and its error
     template = StripJob(
         Path(),
