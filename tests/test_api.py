@@ -194,6 +194,11 @@ def test_waveforms_of_arrays_are_surveyed_and_decomposed(rng):
     block = wb.WaveformBlock.from_samples(np.rint(12 + signal + rng.normal(0, 1, signal.shape)).astype(np.uint8))
     survey = wb.survey(block)
     assert survey == wb.survey([block]) and survey.waveforms == 2000
+    swapped = wb.WaveformBlock.from_samples(block.samples.astype(">u2"), bits=8, spacing=np.float32(1))
+    assert wb.survey(swapped).system == survey.system
+    halves = [wb.WaveformBlock.from_samples(half, spacing=spacing)
+              for half, spacing in zip(np.split(block.samples, 2), (0.3, 0.1 * 3), strict=True)]  # fmt: skip
+    assert wb.survey(halves).waveforms == 2000
     assert survey.system.sigma_ref == pytest.approx(2.3, rel=0.01)
     echoes = wb.auto_chain(survey).run(block, survey.system)
     assert np.array_equal(echoes.waveform, np.arange(2000))
@@ -338,6 +343,8 @@ def test_wrong_use_is_said_in_the_words_of_the_user(strips, tmp_path):
     refuses(wb.StageError, "its mask would be ignored", wb.WaveformBlock.from_samples, masked)
     blocks = [wb.WaveformBlock.from_samples(counts, spacing=spacing) for spacing in (1, 2)]
     refuses(wb.ConfigError, "blocks of one digitizer differ; survey them apart", wb.survey, blocks)
+    table = type("Table", (), {"mask": lambda self: None, "__array__": lambda self, *_args, **_kinds: counts})()
+    assert wb.WaveformBlock.from_samples(table).samples.tolist() == counts.tolist()
     np.testing.assert_array_equal(wb.read_cloud(strips[0], "z")["z"], wb.read_cloud(strips[0], ["z"])["z"])
 
 

@@ -302,7 +302,7 @@ class WaveformBlock:
         StageError
             The samples are not unsigned integers, not two-dimensional, or masked; the spacing is not positive.
         """
-        if hasattr(samples, "mask"):
+        if isinstance(getattr(samples, "mask", None), np.ndarray | np.bool_):  # a table of pandas has a method `mask`
             raise StageError("samples are a masked array, and its mask would be ignored; give a plain array")
         samples = np.ascontiguousarray(samples)
         if samples.ndim != 2 or not samples.shape[1] or samples.dtype.kind != "u" or samples.dtype.itemsize > 4:
@@ -312,10 +312,10 @@ class WaveformBlock:
         if not (isinstance(spacing, int | float | np.number) and 0 < spacing < np.inf):
             raise StageError(f"spacing must be above 0 ns, got {spacing!r}")
         n, s = samples.shape
-        samples = samples.view()
+        samples = samples.astype(samples.dtype.newbyteorder("="), copy=False).view()
         samples.flags.writeable = False
         return cls(
-            digitizer=Digitizer(1, bits or 8 * samples.dtype.itemsize, s, spacing),
+            digitizer=Digitizer(1, bits or 8 * samples.dtype.itemsize, s, float(spacing)),
             samples=samples,
             first=first,
             point=np.arange(first, first + n, dtype=np.int64),

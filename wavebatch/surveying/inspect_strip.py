@@ -8,6 +8,7 @@ error in a file is a finding here, never an exception.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -395,8 +396,10 @@ def survey(
         sample = list(strip) if isinstance(strip, Iterable) else [strip]
         if not all(isinstance(block, WaveformBlock) for block in sample):
             raise ConfigError("survey: give a strip, its path, or blocks of waveforms by `WaveformBlock.from_samples`")
-        kinds = {(block.digitizer.index, block.digitizer.bits, block.spacing) for block in sample}
-        if len({index for index, _, _ in kinds}) < len(kinds):
+        digitizers = [block.digitizer for block in sample]
+        known = {one.index: one for one in digitizers}
+        pairs = [(one, known[one.index]) for one in digitizers]
+        if not all(a.bits == b.bits and math.isclose(a.spacing, b.spacing, rel_tol=1e-6) for a, b in pairs):
             raise ConfigError("survey: the spacing or the bits of blocks of one digitizer differ; survey them apart")
         if not any(map(len, sample)):
             raise InputError("these blocks hold no waveform to be surveyed")
