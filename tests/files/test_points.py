@@ -545,7 +545,8 @@ def test_a_laz_that_claims_too_few_points_is_named(tmp_path):
     simulate_strip("flat", strip, pulses=60, seed=1)
     assert not read_checked_header(strip).warnings
     data = bytearray(strip.read_bytes())
-    data[107:111] = (19).to_bytes(4, "little")
-    strip.write_bytes(data)
-    (line,) = read_checked_header(strip).warnings
-    assert line.startswith("the header claims 19 points, but 60 by return number")
+    for number in (19, 59):
+        data[107:111] = number.to_bytes(4, "little")
+        strip.write_bytes(data)
+        (line,) = read_checked_header(strip).warnings
+        assert line.startswith(f"the header claims {number} points, but 60 by return number")

@@ -241,6 +241,11 @@ def test_figures_are_those_of_what_was_found(find, figures):
     found = tally.figures()
     for name, value in figures.items():
         assert found[name].value == pytest.approx(value, rel=5e-3, abs=1e-4, nan_ok=True), name
+    if find is flag:  # time errors of .01 ns
+        for part in ("value", "error"):
+            scaled = getattr(found["time_calibration_not_hidden"], part)
+            assert getattr(found["rmse_all_cm"], part) == pytest.approx(0.01 * accuracy.CM_PER_NS * scaled, rel=1e-3)
+            assert scaled > 0
 
 
 def test_worker_answers_raises_and_dies():

@@ -128,6 +128,14 @@ def test_the_cube_has_every_sample_on_one_axis_of_time(riegl, tmp_path):
         [line.direction.mean(axis=0) / np.linalg.norm(line.direction.mean(axis=0)) for line in lines], axis=0
     )
     assert np.ptp([start @ mean for start in starts]) < 0.02, "windows that open at other heights keep the relief"
+    begins, at = np.array([0.0, 0.03, 0.07, 5.26]), np.array([0.0, 0.1, 0.2, 0.3, 0.6, 0.7])
+    down, row = np.tile([0.0, 0.0, -HALF_C], (4, 1)), np.arange(4)
+    origin = [0.0, 0.0, 100.0] + down * begins[:, None]
+    line = ScanLine(0, row, row * 1e-5, origin, down, 0.1, np.repeat(row, 6), np.tile(at, 4), np.ones(24, "f4"))
+    cube = build_cube(tmp_path / "e.npz", [line])
+    for pulse, begin in enumerate(begins):
+        there = np.isfinite(cube["values"][0, pulse])
+        assert cube["time"][there] + cube["offset"][0, pulse] == pytest.approx(begin + at, abs=1e-6)
 
 
 def _starts(cube, lines):
