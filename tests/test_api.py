@@ -202,6 +202,7 @@ def test_waveforms_of_arrays_are_surveyed_and_decomposed(rng):
     assert survey.system.sigma_ref == pytest.approx(2.3, rel=0.01)
     echoes = wb.auto_chain(survey).run(block, survey.system)
     assert np.array_equal(echoes.waveform, np.arange(2000))
+    assert np.array_equal(wb.auto_chain(survey).run(swapped, survey.system).time, echoes.time)
     assert np.abs(echoes.time - centre).max() < 0.5
     refuses(wb.ConfigError, "needs the points of a strip", wb.survey, [block], divergence=0.5)
     for nothing in ([], [block.rows(slice(0))]):
