@@ -382,7 +382,7 @@ def test_a_survey_of_which_no_cloud_comes_is_not_kept(strips, flown, tmp_path):
     """The next run may be of other strips, and would take it."""
     wrong = ("--survey", "flight", "--where", "nonsense > 3", "--profile", "fast")
     result = fly(strips["a"], strips["b"], "-o", tmp_path / "out", *wrong)
-    assert result.exit_code == 2 and list((tmp_path / "out").iterdir()) == []
+    assert result.exit_code == 2 and not (tmp_path / "out").exists()
     folder, before = flown[0], read_outputs(flown[0])
     assert fly(strips["c"], "-o", folder, *wrong).exit_code in (2, 4) and read_outputs(folder) == before
 
