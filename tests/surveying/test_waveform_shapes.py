@@ -176,25 +176,48 @@ def amplify(signal, linear, top):
     return np.where(signal > linear, linear + room * np.tanh((signal - linear) / room), signal)
 
 
-@pytest.mark.parametrize("linear", [120, 85])
-def test_tops_that_an_amplifier_clips_have_noise_and_are_one_echo(linear):
+@pytest.mark.parametrize(
+    ("linear", "noise", "least", "most"), [(120, 0.7, 0.87, 0.93), (50, 0.7, 0.65, 0.75), (120, 4.0, 0.7, 0.8)]
+)
+def test_tops_that_an_amplifier_clips_have_noise_and_are_one_echo(linear, noise, least, most):
     """Below the range of the digitizer: no count repeats, and noise made two echoes of each top."""
-    signal, rows, time, height = render(bell, 31, n=600, amplitude=(15, 400), second=0.3)
-    block = digitize(amplify(signal, linear, 120), 31)
+    signal, rows, time, height = render(bell, 31, n=600, amplitude=(15 * max(noise, 1), 400), second=0.3)
+    block = digitize(amplify(signal, linear, 120), 31, noise=noise)
     system, found, true = scores(block, rows, time)
-    assert 0.65 * 120 < system.saturation - BASE < 0.95 * 120 and block.samples.max() > 120 + BASE
+    assert least * 120 < system.saturation - BASE < most * 120 and block.samples.max() > 120 + BASE
     assert found > 0.99 and true > 0.985
     own = load_profile("accurate").run(block, system)
     assert (own.flags[own.amplitude > 150] & np.uint16(EchoFlag.SATURATED)).all()
 
 
-@pytest.mark.parametrize("wide", [1.0, 3.0])
-def test_targets_of_one_brightness_are_not_clipped(wide):
-    """Half of the echoes are as high as the highest ones, as a road is, and lie over weaker, narrower ones."""
-    weak, bright = render(bell, 32, n=300, amplitude=(15, 100))[0], render(bell, 33, n=300, width=2 * wide)
-    noise = np.random.default_rng(33).normal(1, 0.01, (300, 1))
-    high = 120 * noise * bell((np.arange(80) - bright[2][:, None]) / (2 * wide))
-    assert survey_block(digitize(np.concatenate([weak, high]), 32)).system.saturation is None
+@pytest.mark.parametrize(
+    ("pulse", "width", "bright", "scatter", "gap", "lower"),
+    [
+        (bell, 2, 120, 0.01, 0, 2),
+        (bell, 6, 120, 0.01, 0, 2),
+        (bell, 2, 110, 0.01, 3.2, 2.6),
+        (lambda x: 0.5 ** np.abs(x / 1.18) ** 4, 2, 200, 0.03, 0, 2.6),
+    ],
+    ids=["same", "wide", "merged", "flat"],
+)
+def test_targets_of_one_brightness_are_not_clipped(pulse, width, bright, scatter, gap, lower):
+    """Half of the echoes are as high as the highest ones, as roads, crops and roofs are, and lie over weaker ones."""
+    weak, first = render(bell, 32, n=300, amplitude=(15, 75), width=lower)[0], render(bell, 33, n=300)[2]
+    rng = np.random.default_rng(33)
+    apart, height = gap * rng.normal(1, 0.05, 300), bright * rng.normal(1, scatter, (300, 1))
+    high = [height * pulse((np.arange(80) - time[:, None]) / width) for time in (first, first + apart)]
+    signal = np.concatenate([weak, sum(high) if gap else high[0]])
+    assert survey_block(digitize(signal, 32)).system.saturation is None
+
+
+@pytest.mark.parametrize(
+    ("linear", "top", "noise", "saturation"),
+    [(120, 200, 0.7, None), (600, 1000, 0.7, 255), (120, 120, 5.0, pytest.approx(BASE + 109, abs=3))],
+)
+def test_levels_of_tops_that_thin_out_clip_at_full_scale_or_are_noisy(linear, top, noise, saturation):
+    """An amplifier that compresses more than it clips, a digitizer that clips, and noises of a tenth of the height."""
+    signal = amplify(render(bell, 34, n=600, amplitude=(15, 250 if top == 200 else 2 * linear))[0], linear, top)
+    assert measure_gaussian(digitize(signal, 34, noise=noise)).saturation == saturation
 
 
 def count_photons(signal, seed, growth):

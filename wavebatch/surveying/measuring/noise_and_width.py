@@ -90,13 +90,11 @@ TOP_STEP, PILED, SMALL_PILE = 0.9, 2, 60
 """Share of the height of the highest FEW waveforms from which others are as high; how many more these are than those a
 step below; waveforms from which that is looked for. Heights of echoes thin out towards the highest ones."""
 
-POINTED = 0.456
-"""Width of a Gaussian at three quarters of its height, over that at a quarter: echoes near others seem more pointed."""
-
 FLATTER, MIDDLE, LEAST_TOP, MOST_TOPS = 1.05, 0.6, 0.2, 1024
-"""Flatness of the tops over that of all but the flattest lower ones, from which an amplifier clips them: it is 1.02 at
-most in strips that do not, 1.25 where those of echoes up to twice as high are cut. Shares of the height below which,
-and from which, waveforms are lower ones; and how many are looked at."""
+"""Flatness of the tops over that of all but the flattest lower ones, and of the wider half of the tops over that of the
+others, from which an amplifier clips them: 1.25 and 1.15 where those of echoes up to twice as high are cut. At most
+1.02 for targets of one layer, 1.05 for the second where two merge: further apart, heights do not pile up. Shares of the
+height below which, and from which, waveforms are lower ones; and how many are looked at."""
 
 QUIET_FROM = 3
 """Widths from an echo from which samples are quiet."""
@@ -320,17 +318,16 @@ def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
 def find_flat_tops(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     """The system with `saturation` where an amplifier clips before the converter, so that flat tops have noise (H6).
 
-    Many waveforms are then as high as the highest ones, and flatter than lower ones. Targets of one brightness are as
-    high too, but as pointed. Flatness is the width of a waveform's highest peak at three quarters of its height over
-    that at a quarter, which targets do not change.
+    Many waveforms are then as high as the highest ones, flatter than lower ones, and the flatter the wider they are.
+    Targets of one brightness are as high too, and may merge or their pulse be flat, but all are as flat. Flatness is
+    the width of a waveform's highest peak at three quarters of its height over that at a quarter.
     """
     level = system.noise.baseline
     height = block.samples.max(axis=1) - np.float32(level)
-    open_top = height < (np.inf if system.saturation is None else system.saturation - level)
-    if np.count_nonzero(open_top) < SMALL_PILE or block.samples.shape[1] < 2:
+    if system.saturation is not None or len(height) < SMALL_PILE or block.samples.shape[1] < 2:
         return system
-    top = float(np.partition(height[open_top], -FEW)[-FEW])
-    share = np.where(open_top, height / max(top, 1e-9), 0.0)
+    top = float(np.partition(height, -FEW)[-FEW])
+    share = height / max(top, 1e-9)
     piled, under = np.count_nonzero(share >= TOP_STEP), np.count_nonzero(share >= 2 * TOP_STEP - 1)
     if top < MIN_SNR * system.noise.std or piled < PILED * (under - piled):
         return system
@@ -350,8 +347,12 @@ def find_flat_tops(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
             width -= (part * height - signal[row, at]) / rise
         widths.append(np.where(whole, width, 0.0))
     flat = widths[0] / np.maximum(widths[1], 1e-9)
-    lower, highest = flat[(share < MIDDLE) & (flat > 0)], flat[share >= TOP_STEP]
-    if min(len(lower), len(highest)) < FEW or median(highest) < max(FLATTER * quantile(lower, 0.84), POINTED):
+    lower, highest = flat[(share < MIDDLE) & (flat > 0)], (share >= TOP_STEP) & (flat > 0)
+    few = len(lower) < FEW or np.count_nonzero(highest) < FEW
+    if few or median(flat[highest]) < FLATTER * quantile(lower, 0.84):
+        return system
+    wide = widths[1] > median(widths[1][highest])
+    if not median(flat[highest & wide]) >= FLATTER * median(flat[highest & ~wide]):  # one width only: not a number
         return system
     clip = TOP_STEP
     while clip > MIDDLE:  # what an amplifier compresses before it clips is as wrong
