@@ -23,7 +23,7 @@ from pathlib import Path
 from table import HEADS
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.tools.sheets.page import check_page, render, text, write_page
+from wavebatch.tools.sheets.page import check_page, render, section, text, write_page
 from wavebatch.tools.sheets.sheet import Cell, Code, Note, Part, Table
 
 FOLDER = Path(__file__).resolve().parent
@@ -315,8 +315,7 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[Part | str],
             inner += [fold(table) for table in tables]
             if not tables:
                 inner.append(render(Note(f"{paper.script}.py printed no table; run it to see why", "warning")))
-            body = "\n".join(inner)
-            parts.append(f'<section id="{mark}">\n<h2>{text(paper.title)}</h2>\n{body}\n</section>')
+            parts.append(section(paper.title, *inner, mark=mark))
     if not drawing:
         errors = ["no pictures: matplotlib is not installed (pip install matplotlib)"]
     intro = (

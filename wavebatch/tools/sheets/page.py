@@ -103,6 +103,12 @@ def text(value: Any) -> str:
     return html.escape(plain.encode(errors="backslashreplace").decode(), quote=True)
 
 
+def section(title: str, *parts: str, level: int = 2, mark: str = "") -> str:
+    """Parts of a page, which are HTML, under a heading; mark: its target of links."""
+    place = f' id="{text(mark)}"' if mark else ""
+    return f"<section{place}>\n<h{level}>{text(title)}</h{level}>\n" + "\n".join(filter(None, parts)) + "\n</section>"
+
+
 def render(part: Part, level: int = 2) -> str:
     """A part as HTML; level: of its heading."""
     return "\n".join(_render([part], level))
@@ -145,10 +151,7 @@ def _render(parts: Iterable[Part | str], level: int) -> Iterator[str]:
                 except (InputError, ConfigError, StageError, OSError) as error:
                     yield render(Note(f"{one.what} cannot be drawn: {error}", "warning"))
         else:
-            for one in some:
-                place = f' id="{text(one.mark)}"' if one.mark else ""
-                inner = "\n".join(filter(None, _render(one.parts, level + 1)))
-                yield f"<section{place}>\n<h{level}>{text(one.title)}</h{level}>\n{inner}\n</section>"
+            yield from (section(one.title, *_render(one.parts, level + 1), level=level, mark=one.mark) for one in some)
 
 
 def _table(one: Table) -> str:
