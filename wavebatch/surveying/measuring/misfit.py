@@ -96,8 +96,9 @@ PEAK, ABOVE_NOISE = 4.0, 3.0
 """Largest difference of a pulse from its model over the misfit, which is a mean over the echo; and noises that an echo
 must be high beside the strip's strongest ones, which taught the pulse."""
 
-UNEXPLAINED = 0.05
-"""Share of clear echoes that may miss their samples: neighbours too close to be found change the shape of some."""
+UNEXPLAINED, NEIGHBOURS = 0.05, 0.8
+"""Share of clear echoes that may miss their samples in a dense canopy, whose echoes have so many neighbours APART:
+neighbours too close to be found change the shape of some. Where neighbours are rare these are, in proportion."""
 
 JUST, APART, MOST_PROVEN = 1.05, (1.5, 4.0), 0.5
 """How much more than PROVEN errors of its amplitude an echo may have that chi2 alone proves. Distances, in widths of
@@ -159,16 +160,22 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     if np.count_nonzero(clear) < FEW:
         return system.misfit, 0.0
+    row, distance = _list_distances(echoes, system.sigma_ref)
+    apart = np.count_nonzero(clear[row] & (distance >= APART[0]) & (distance < APART[1]))
+    hidden = UNEXPLAINED * min(apart / np.count_nonzero(clear) / NEIGHBOURS, 1.0)
     alone = clear & echoes.alone(int(echoes.waveform.max()) + 1)
-    if np.count_nonzero(alone) >= FEW:
-        left = float(np.mean(find_unexplained(echoes, system, spacing)[alone] > 1))
-        if left <= UNEXPLAINED:
-            return system.misfit, left
+    groups = [alone, clear] if np.count_nonzero(alone) >= FEW else [clear]
     while True:
-        left = float(np.mean(find_unexplained(echoes, system, spacing)[clear] > 1))
-        if left <= UNEXPLAINED or system.misfit >= MOST_MISFIT:
+        missed = find_unexplained(echoes, system, spacing) > 1
+        for group in groups:
+            number, expected = np.count_nonzero(missed[group]), hidden * np.count_nonzero(group)
+            left = number / np.count_nonzero(group)
+            if left <= UNEXPLAINED and number <= expected + SURE * np.sqrt(expected + 1):
+                return system.misfit, left
+        if system.misfit >= MOST_MISFIT:
             return system.misfit, left
         system = replace(system, misfit=max(STEP_OF_MISFITS * system.misfit, LEAST_MISFIT))
+        groups = [clear]
 
 
 def suspect_pairs(echoes: EchoTable, width: float) -> bool:
@@ -188,12 +195,19 @@ def suspect_pairs(echoes: EchoTable, width: float) -> bool:
     """
     doubtful = (echoes.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
     doubtful &= echoes.amplitude < JUST * PROVEN * echoes.amplitude_err
-    proven, apart = 0, 0
-    for row, _, lag in list_neighbours(echoes):  # each pair from both sides
-        distance = np.abs(lag) / width
-        proven += int(np.count_nonzero(doubtful[row] & (distance < APART[0])))
-        apart += int(np.count_nonzero((distance >= APART[0]) & (distance < APART[1])))
-    return proven > MOST_PROVEN * apart / 2
+    row, distance = _list_distances(echoes, width)
+    proven = np.count_nonzero(doubtful[row] & (distance < APART[0]))
+    apart = np.count_nonzero((distance >= APART[0]) & (distance < APART[1]))
+    return bool(proven > MOST_PROVEN * apart / 2)
+
+
+def _list_distances(echoes: EchoTable, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of echoes that have a neighbour, and its distance [widths]: each pair from both sides."""
+    pairs = [(row, np.abs(lag) / width) for row, _, lag in list_neighbours(echoes)]
+    if not pairs:
+        return np.empty(0, np.int64), np.empty(0)
+    row, distance = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return row, distance
 
 
 def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -> SystemPulse:
