@@ -180,6 +180,25 @@ def test_fits_of_echoes_alone_decide_whether_the_misfit_is_raised(alone, raised)
     assert (cover_fits(system, table, 1.0)[0] > 0) == raised
 
 
+@pytest.mark.parametrize(("close", "raised"), [(0, True), (300, False)])
+def test_fits_that_miss_their_samples_are_neighbours_only_where_there_are_some(close, raised):
+    """3 % of 300 that are alone: in a canopy the rest has neighbours that are no rarer where they are not found."""
+    waveform = np.r_[np.arange(300), np.repeat(np.arange(300, 600), 2)]
+    time = np.r_[np.full(300, 20.0), np.tile([20.0, 25.0 if close else 90.0], 300)]
+    table = EchoTable.build(waveform, time, np.full(900, 200.0), np.full(900, 2.0),
+                            residual=np.where(np.arange(900) % 33, 1.0, 3.0))  # fmt: skip
+    system = SystemPulse(sigma_ref=2.0, noise=ReceiverNoise(baseline=12.0, std=1.0))
+    assert (cover_fits(system, table, 1.0)[0] > 0) == raised
+
+
+@pytest.mark.quick_cases("4385")
+@pytest.mark.parametrize("number", [3230, 4385])
+def test_a_pulse_that_changes_is_seen_where_neighbours_are_rare(number, tmp_path):
+    """3 to 5 % of the fits of lone echoes missed their samples, as in canopies: 4 % of the echoes were false."""
+    result = judge_strip(number, tmp_path)
+    assert result["right"] and result["extra"] < 0.02
+
+
 @pytest.mark.quick_cases("1398")
 @pytest.mark.parametrize("number", [1398, 1836, 1661])
 def test_neighbours_raise_neither_misfit_nor_significance(number, tmp_path):
@@ -188,11 +207,13 @@ def test_neighbours_raise_neither_misfit_nor_significance(number, tmp_path):
     assert result["right"] and result["missed"] < 0.03
 
 
-def test_echoes_hidden_in_the_noise_are_not_taken_for_it(tmp_path):
-    """Short packets full of leaves: noise was 1.4 times as large, 4 % of the clear echoes were lost."""
-    result = judge_strip(2395, tmp_path)
-    assert result["right"] and result["missed"] < 0.02 and result["extra"] < 0.01
-    with wavebatch.open_strip(make_strip(2395, tmp_path)) as strip:
+@pytest.mark.quick_cases("2395")
+@pytest.mark.parametrize(("number", "missed"), [(2395, 0.02), (1355, 0.01), (3682, 0.035), (1274, 0.035)])
+def test_echoes_hidden_in_the_noise_are_not_taken_for_it(number, missed, tmp_path):
+    """Short packets full of leaves: noise was up to 1.7 times as large, 4 to 5 % of the clear echoes were lost."""
+    result = judge_strip(number, tmp_path)
+    assert result["right"] and result["missed"] < missed and result["extra"] < 0.01
+    with wavebatch.open_strip(make_strip(number, tmp_path)) as strip:
         reasons = {one.part: one.reason for one in wavebatch.survey(strip).decisions}
     less, more = map(float, re.findall(r"\d\.\d+", reasons["echoes hidden in the noise"]))
     assert less < 0.9 * more

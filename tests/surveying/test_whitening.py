@@ -146,6 +146,7 @@ def test_weak_echoes_are_taken_off_the_noise_and_slow_noise_is_not(kind, lowered
     found, _ = lower_noise(block, SystemPulse(sigma_ref=width, noise=noise))
     assert (found.std < 0.95 * noise.std) == lowered and (found is noise) == (not lowered)
     assert found.std >= 1.1 and noise.std > 1.5
+    assert not lowered or found.std < 1.25  # further steps are likely only: sure ones alone end at 1.34
 
 
 @pytest.mark.parametrize(("quiet", "least"), [(0.2, DITHERED), (0.6, 0.6)])

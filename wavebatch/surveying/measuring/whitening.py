@@ -49,8 +49,8 @@ LOWER = 0.9
 """Step by which less noise is tried: that of a significance in `settle`, over its first."""
 
 LIKELY = 1.0
-"""Standard errors by which a further step must be shorter, once one is sure: each step alone adds few echoes, and SURE of
-each stopped where noise was still 1.2 to 1.6 times too large."""
+"""Standard errors by which a further step must be shorter, once one is sure: each step alone adds few echoes, and SURE
+of each stopped where noise was still 1.2 to 1.6 times too large."""
 
 LESS = 0.97
 """Noise over another one up to which it is less: it moves one echo in a hundred."""
