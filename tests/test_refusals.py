@@ -369,6 +369,7 @@ PICTURES = [
     ("plot histogram cloud.laz --column z -o p.gif", 2, ".png, .svg, .pdf"),
     (f"{HISTOGRAM} --column z --range 5:1", 2, "does not go up"),
     (f"{HISTOGRAM} --column z --range nan:1", 2, "does not go up"),
+    (f"{HISTOGRAM} --column z --range 0:inf", 2, "does not go up"),
     (f"{HISTOGRAM} --column echo_flags --bins 3", 2, "--bins"), (MAP, 2, "needs a --column"),
     (f"{MAP} --column echo_flags", 2, "cloud.laz: echo_flags are bits, which have no mean; count"),
     *((f"{MAP} --column z --bbox {box}", 2, "WEST,SOUTH,EAST,NORTH") for box in ("1,2,3", "1,0,0,1")),

@@ -224,8 +224,10 @@ def test_a_strip_of_a_flight_that_cannot_be_read_is_one_line(flat_strip, tmp_pat
 def test_the_sensor_that_a_pulse_looks_like_is_named(riegl, flat_strip, tmp_path):
     sentence = "this strip's pulse looks like RIEGL LMS-Q680i; it differs by "
     used = "RIEGL LMS-Q680i: its shipped pulse is used"
-    assert any(line.startswith("sensor") and used in line for line in _survey(riegl).stdout.splitlines())
-    assert "system pulse      sum of 5 Gaussians; " in _survey(riegl).stdout, "it was not learned here"
+    shown = _survey(riegl).stdout
+    assert any(line.startswith("sensor") and used in line for line in shown.splitlines())
+    assert "system pulse      sum of 5 Gaussians; " in shown, "it was not learned here"
+    assert json.loads(_survey(riegl, "--json").stdout)["looks_like"]["taken"] is True
     small = _survey(cut_strip(riegl, tmp_path / "small.las", 11)).stdout
     assert used in small and "riegl-q680i: " in small
     assert "looks like" not in _survey(flat_strip).stdout

@@ -1,13 +1,15 @@
 """An echo is known or it is not there: what errors that hold more than noise leave of a decomposition."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.decompose.solve import CLUSTER, FACTOR, _find_unknown
 from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 
@@ -43,6 +45,18 @@ def test_an_echo_that_more_than_noise_explains_is_left_out(height, variance, num
     # What the level's error does to a fit it does to the fit again, too.
     known, free = (np.median(one.amplitude_err[one.amplitude > 100]) for one in (found, find(block, system, 5.0)))
     assert abs(free / known - 1) > 0.04 and known < 4
+    # The fit again has its own covariances: an energy is at most as sure as its amplitude.
+    strong = found.take(found.amplitude > 100)
+    assert np.median(strong.relative_energy_err * strong.amplitude / strong.amplitude_err) > 0.99
+
+
+def test_echoes_are_asked_again_where_their_errors_grew_by_more_than_a_tenth():
+    """Since they were asked: by 5 and 20 %, and by 5 % in noise 20 % larger. The strong echo beside each is known."""
+    table = EchoTable.build(np.repeat(np.arange(3), 2), np.arange(6.0), np.resize([100.0, 2.0], 6), np.full(6, SIGMA),
+                            amplitude_err=np.full(6, 2.5))  # fmt: skip
+    table = table.with_attributes(**{CLUSTER: table.waveform, FACTOR: np.repeat([1.05, 1.2, 1.26], 2)})
+    settings = SimpleNamespace(known=1.0)
+    assert _find_unknown(table, settings, np.array([1.0, 1.0, 1.2])).tolist() == [0.0, 1.2, 0.0]
 
 
 def test_rows_stay_sorted_and_other_waveforms_as_they_are():

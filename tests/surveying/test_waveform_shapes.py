@@ -18,7 +18,7 @@ from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.measuring.joint_pulse import stack_jointly
 from wavebatch.surveying.measuring.judge import explain
 from wavebatch.surveying.measuring.learn_pulse import find_clear
-from wavebatch.surveying.measuring.noise_and_width import measure_gaussian, thin_empty
+from wavebatch.surveying.measuring.noise_and_width import find_flat_tops, measure_gaussian, thin_empty
 from wavebatch.surveying.measuring.residuals import decompose_sample, guess_growth, render_own, subtract_echoes
 from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey, parse_survey
 
@@ -208,6 +208,19 @@ def test_targets_of_one_brightness_are_not_clipped(pulse, width, bright, scatter
     high = [height * pulse((np.arange(80) - time[:, None]) / width) for time in (first, first + apart)]
     signal = np.concatenate([weak, sum(high) if gap else high[0]])
     assert survey_block(digitize(signal, 32)).system.saturation is None
+
+
+def test_bright_crops_over_lower_ones_are_not_clipped():
+    """Two layers, 2 widths apart or less, make each bright echo and three in ten lower ones: some of these are as flat.
+    """
+    rng, low = np.random.default_rng(0), np.arange(600) < 300
+    height = np.where(low, np.exp(rng.uniform(np.log(15), np.log(100), 600)), 120 * rng.normal(1, 0.01, 600))
+    apart = np.where(low & (rng.random(600) > 0.3), 0.0, rng.uniform(2.5, 4.0, 600))
+    x = (np.arange(80) - rng.uniform(25, 40, 600)[:, None]) / 2
+    both = bell(x) + bell(x - apart[:, None] / 2)
+    block = digitize(both * (height / both.max(axis=1))[:, None], 32)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=BASE, std=0.76))
+    assert find_flat_tops(block, system) is system
 
 
 @pytest.mark.parametrize(

@@ -880,6 +880,29 @@ def test_errors_of_shares_are_those_of_voxels_with_as_many_rays():
     assert many.mean() == pytest.approx(0.67, abs=0.04)
 
 
+def test_errors_of_shares_hold_that_of_the_ratio():
+    """By as much as the share moves with the logarithm of the ratio of reflectances."""
+    table, samples = np.zeros(40, rays.RAY), np.zeros(80, rays.SAMPLE)
+    table["start"], table["step"], table["end"] = (0.5, 0.5, 9.0), (0.0, 0.0, -1.0), 9.0
+    table["known"], table["count"], table["first"] = np.inf, 2, 2 * np.arange(40)
+    samples["packet"], samples["time"], samples["spacing"] = np.arange(80) // 2, np.resize([3.5, 8.5], 80), 0.1
+    samples["canopy"][::2], samples["ground"][1::2], samples["energy"] = 0.6, 0.4, 1.0
+
+    def measure(ratio, *log_error):
+        with VoxelGrid(1.0, np.zeros(3, np.int64), 2.0**-20, sections=False, everything=True) as grid:
+            grid.add(rays.Rays(table, samples), rays.LightRule(ratio))
+            grid.measure_spread()
+            (index, found), = grid.pieces(*log_error)
+        return (found[name][index[:, 2] == 5].item() for name in ("share", "share_error"))
+
+    share, alone = measure(2.0)
+    _, error = measure(2.0, 0.25)
+    step = 0.01
+    (less, _), (more, _) = (measure(2.0 * np.exp(sign * step)) for sign in (-1, 1))
+    assert share == pytest.approx(0.6 / (0.6 + 2.0 * 0.4), rel=1e-4)
+    assert error**2 - alone**2 == pytest.approx((0.25 * (more - less) / (2 * step)) ** 2, rel=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("clumps", "density"), [(None, 0.25), (0.35, 0.3), (0.35, 0.7)])
 def test_errors_of_shares_cover_the_truth(tmp_path, clumps, density):
