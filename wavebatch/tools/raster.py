@@ -90,8 +90,8 @@ class _Sums(NamedTuple):
 
     near: np.ndarray
     """With the attenuation of each voxel."""
-    far: np.ndarray
-    """With that of blocks of eight voxels."""
+    clumped: np.ndarray
+    """By how much less it is with the attenuation of blocks of voxels, which extrapolates to voxels without size."""
     variance: np.ndarray
     """Of `near`, by the errors of the voxels."""
     unknown: np.ndarray
@@ -99,8 +99,7 @@ class _Sums(NamedTuple):
 
     def total(self, group: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Leaf area, and its variance, of each group, f8 (number,)."""
-        near, far, variance, unknown = (np.bincount(group, part, number) for part in self)
-        clumped = near - far
+        near, clumped, variance, unknown = (np.bincount(group, part, number) for part in self)
         return np.maximum(near + clumped, 0.0), variance + clumped**2 + unknown**2
 
 
@@ -122,10 +121,11 @@ class Forest:
                 )
             ratio = found.get("reflectance_ratio")
             ratio = ratio if isinstance(ratio, dict) else {}
-            numbers = found.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
+            rest = ratio.get("error") or 1.0, found.get("footprint_m") or 1.0
+            numbers = found.get("size_m"), ratio.get("ratio"), *rest
             if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
-                raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it "
-                                  "anew with wavebatch voxelize --forest")  # fmt: skip
+                raise ConfigError(f"{path}: its record of voxels is damaged, at size_m, footprint_m or "
+                                  "reflectance_ratio; make it anew with wavebatch voxelize --forest")  # fmt: skip
             facts.append((path, found))
         self.size = facts[0][1]["size_m"]
         for name, words in (("size_m", "--size"), ("ground_height_m", "--ground-height")):
@@ -140,6 +140,13 @@ class Forest:
             raise ConfigError(f"--layer {options.layer:g}: layers are thinner than the voxels, so that some would have "
                               f"none; give {self.size:g} or more")  # fmt: skip
         self.options = options
+        # Of footprints, in voxels: what is smeared over both is as wide as the root of the sum of their squares. Blocks
+        # are twice that, so that clumps are compared on two scales that both are seen.
+        wide = max(one.get("footprint_m") or 0.0 for _, one in facts) / self.size
+        self.block = math.ceil(math.sqrt(4.0 + 3.0 * wide**2) - 1e-9)
+        near, far = math.hypot(1.0, wide), math.hypot(self.block, wide)
+        self.reach = near / (far - near)
+        """Share of what the leaf area of blocks differs by from that of voxels: so far voxels are from size 0."""
         ratios = [one["reflectance_ratio"] for _, one in facts]
         errors = (ASSUMED_ERROR if one.get("source") == "assumed" else (one.get("error") or 0.0) / one["ratio"]
                   for one in ratios)  # fmt: skip
@@ -212,8 +219,8 @@ class Forest:
         thick = np.clip(voxels.height + 0.5 * self.size, 0.0, self.size)
         whole = np.bincount(slot, weight, len(keys)) + air
         whole = np.where(whole > 0, whole, 1.0)
-        block = np.unique(np.stack([voxels.cell, voxels.x // 2, voxels.y // 2, voxels.layer // 2]), axis=1,
-                          return_inverse=True)[1].ravel()  # fmt: skip
+        part = np.stack([voxels.cell, voxels.x // self.block, voxels.y // self.block, voxels.layer // 2])
+        block = np.unique(part, axis=1, return_inverse=True)[1].ravel()
         free, caught = (np.bincount(block, np.where(known, part, 0.0)) for part in (voxels.free_path, voxels.plants))
         both = (_zeroed(voxels.attenuation), (caught / np.where(free > 0, free, 1.0))[block])
         unknown = (1.0 - (air + np.bincount(slot, known, len(keys))) / there).clip(0.0, 1.0)
@@ -226,7 +233,8 @@ class Forest:
                                          np.bincount(slot, dark * thick * one, len(keys)) * unknown / divisor)
                                         for one in both)  # fmt: skip
         variance = np.bincount(slot, (weight * thick * _zeroed(voxels.error)) ** 2, len(keys)) * seen**2
-        return (cell, height), _Sums(near + hidden, far + other, variance, hidden)
+        clumped = self.reach * (near + hidden - far - other)
+        return (cell, height), _Sums(near + hidden, clumped, variance, hidden)
 
 
 def _join(values: np.ndarray, cell: np.ndarray, size: float) -> _Voxels:

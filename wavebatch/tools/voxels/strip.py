@@ -53,6 +53,9 @@ SAMPLED = 4096
 WIDE = 1.0
 """Of footprints whose beam is not known [m]: most are smaller."""
 
+TOO_WIDE = 2.5
+"""Of footprints from which crowns of 3 to 6 m cannot be told from even layers [m] (docs/forest.md)."""
+
 _SAMPLED_UNITS = 16
 """Units that they are read from."""
 
@@ -240,8 +243,8 @@ def voxelize_strip(
         tracer = _Tracer(
             reader, source, pulse, options, floor.finish(), ceiling.finish(), energy, calibration is not None
         )
-        wide = 1e-3 * (pulse.radiometry.divergence or 0.0) * (source.distance or 0.0)
-        assumed, wide = "" if wide else " (assumed, as beam or range are not known)", wide or WIDE
+        footprint = 1e-3 * (pulse.radiometry.divergence or 0.0) * (source.distance or 0.0)
+        assumed, wide = "" if footprint else " (assumed, as beam or range are not known)", footprint or WIDE
         # Half of it rises to the edge of a footprint; the planes are not known better than to the other half.
         if options.forest and wide * floor.steep > options.ground_height:
             doubts += (
@@ -249,6 +252,12 @@ def voxelize_strip(
                 f"m{assumed} reaches above --ground-height {options.ground_height:g} and counts as plants, so that "
                 "cover and leaf area are too large: give --ground-height "
                 f"{options.ground_height + 0.5 * wide * floor.steep:.1f}",
+            )
+        if options.forest and not 0.0 < footprint < TOO_WIDE:
+            which = f"of {footprint:.2g} m" if footprint else "of unknown width (give --system with divergence_mrad)"
+            doubts += (
+                f"leaf areas: footprints {which} do not show narrower gaps between leaves: where crowns are no wider, "
+                "leaf areas are too small by more than their errors",
             )
         numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
         each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
@@ -295,6 +304,7 @@ def voxelize_strip(
                 "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source},
                 "hidden_light": rule.hidden_light,
                 "cross_section_error": section_error,
+                "footprint_m": footprint or None,
             }
             meta["pulse_energy"] = None if energy is None else energy.describe()
             space = voxel_grid.VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
