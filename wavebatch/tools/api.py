@@ -72,7 +72,14 @@ def auto_chain(survey: Survey) -> Chain:
     -------
     Chain
         The chain that `run` would choose for this strip.
+
+    Raises
+    ------
+    ConfigError
+        Where it is no Survey.
     """
+    if not isinstance(survey, Survey):
+        raise ConfigError(f"auto_chain: give a Survey, which wavebatch.survey returns, not a {type(survey).__name__}")
     return choose_chain(survey)
 
 
@@ -198,13 +205,13 @@ def plan_run(
             raise ConfigError(str(error)) from error
     given = {
         "--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": template.calibration,
-        "--attenuation": template.attenuation, "--energy": None if template.energy == NONE else template.energy,
+        "--attenuation": options.attenuation, "--visibility": options.visibility,
+        "--energy": None if template.energy == NONE else template.energy,
     }  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(found):
-        stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
-                  "--energy": "amplitude_normalized"}  # fmt: skip
-        name = stages.get(option, "range")
+        stages = {"--trajectory": "range", "--flight-height": "range", "--calibration": "backscatter_coefficient"}
+        name = stages.get(option, "amplitude_normalized")
         remedy = f"give --columns +{name}, or add stage attribute.{name} to a chain file"
         raise ConfigError(f"{option}: chain {found.name} computes nothing from it; {remedy}")
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips),

@@ -289,6 +289,8 @@ PACKED_BITS = (10, 12)
 MOST_BITS = 32
 MAX_SPACING = 1000.0
 """Largest spacing of samples [ns]; digitizers have 0.2 to 10 ns, a larger one is damage."""
+MOST_STORED = 2**31 - 1
+"""Largest stored coordinate."""
 MAX_LOCATION = 1e9
 """Largest return location [ps]: 1 ms is 150 km of range; a larger one is damage."""
 
@@ -312,6 +314,7 @@ class Reason(IntEnum):
     PACKED = 8
     DAMAGED = 9
     CUT = 10
+    AT_LIMIT = 11
 
 
 REASON_TEXTS = {
@@ -325,6 +328,8 @@ REASON_TEXTS = {
     Reason.PACKED: "with samples of other than 8, 16 or 32 bits, and a packet size that fits neither whole bytes "
     "nor packed samples of 10 or 12 bits",
     Reason.DAMAGED: "with a compressed packet that is damaged",
+    Reason.AT_LIMIT: "with coordinates at the limit of the file's integers, where echoes cannot be stored (damage, or "
+    "too small a scale)",
 }
 
 
@@ -362,9 +367,10 @@ class Judge:
     def __init__(self, facts: StripFacts) -> None:
         self._facts = facts
         known, good, odd, packs, self._compressed = (np.zeros(256, bool) for _ in range(5))
+        self._spacing = np.zeros(256)
         width, samples, packed = np.ones(256, np.int64), np.zeros(256, np.int64), np.full(256, -1, np.int64)
         for index, digitizer in facts.digitizers.items():
-            known[index] = True
+            known[index], self._spacing[index] = True, digitizer.spacing
             good[index] = 0 < digitizer.bits <= MOST_BITS and 0 < digitizer.spacing <= MAX_SPACING
             good[index] &= 0 < digitizer.n_samples <= MAX_SAMPLES
             kind = facts.compression.get(index, 0)
@@ -406,6 +412,8 @@ class Judge:
                 raise refuse_compressed(self._facts.path, self._facts.compression[int(used[np.argmax(bad)])])
         geometry = Geometry(form == "range", PS_PER_NS / HALF_C, RANGE_RATIO, MAX_LOCATION)
         reason, n_samples, keys, short, packed = judge_packets(fields, self._rules, geometry)
+        far = self._find_far(points, form, n_samples)
+        reason[far], n_samples[far], short[far] = Reason.AT_LIMIT, 0, False
         if overfull is not None and len(overfull):
             place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
             full = (overfull[place] == keys) & (reason == Reason.USABLE)
@@ -428,6 +436,23 @@ class Judge:
             broken = rows[~good]
             reason[broken], n_samples[broken], short[broken] = Reason.DAMAGED, 0, False
         return Judged(reason, n_samples, keys, short, packed)
+
+    def _find_far(self, points: np.ndarray, form: str, n_samples: np.ndarray) -> np.ndarray:
+        """Return the rows of points with usable packets whose echoes may lie beyond the integers of the file.
+
+        One damaged coordinate (-2^31) would otherwise fail the strip, and make a grid of voxels as wide as the Earth.
+        """
+        stored = [points[axis] for axis in "XYZ"]
+        if not len(points) or max(max(int(one.max()), -int(one.min())) for one in stored) < MOST_STORED // 2:
+            return np.empty(0, np.int64)
+        far = np.flatnonzero(n_samples)
+        xyz = np.stack([one[far].astype(np.float64) for one in stored], axis=1)
+        location = np.abs(widen_integers(points["return_point_wave_location"][far]))
+        # From a return to an echo: at most its location and the length of the packet; an offset may double it.
+        time = 2.0 * (location + PS_PER_NS * n_samples[far] * self._spacing[points["wavepacket_index"][far]])
+        with np.errstate(all="ignore"):
+            reach = np.abs(read_toward(points[far], "toward", form)) * time[:, None] / self._facts.header.scales
+            return far[np.any(np.abs(xyz) + np.abs(reach) > MOST_STORED, axis=1)]
 
 
 def packed_bytes(n_samples: int, bits: int) -> int:
