@@ -229,6 +229,7 @@ def test_chains_come_by_name_or_path(tmp_path):
     assert len(wb.load_chain(str(path)).steps) == 3
     refuses(wb.ConfigError, "profile 'acurate' does not exist; did you mean 'accurate'", wb.load_chain, "acurate")
     refuses(wb.ConfigError, "none.toml: chain file cannot be read", wb.load_chain, "none.toml")
+    refuses(wb.ConfigError, "auto_chain: give a Survey, .* not a dict", wb.auto_chain, {})
 
 
 # A run

@@ -3,16 +3,19 @@
 import json
 import os
 import random
+import re
 import subprocess
 import sys
 import time
 
+import laspy
 import numpy as np
 import pytest
 from commands import run_command, succeed
 from strips import make_raw
 
 from wavebatch.cli.messages import printable
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.files import text_file
 from wavebatch.tools.simulate import simulate_strip
 
@@ -74,6 +77,47 @@ def test_what_a_strip_lacks_is_named_by_all_that_read_packets(tmp_path, command)
         assert "the header claims" in succeed("stats", strip).stdout
         lost = "with a packet before the start" if command == "run" else "cannot be used"
         assert "warning: the header claims" in said and lost in said, said
+
+
+def test_a_cloud_that_seems_to_hold_more_points_is_named_by_all_that_read_it(tmp_path):
+    """Maps and rasters of a part of the points had no word about the others."""
+    strip, cloud = tmp_path / "a.las", tmp_path / "out" / "a.las"
+    simulate_strip("urban", strip, pulses=300, seed=1)
+    succeed("run", strip, "-o", cloud.parent, "--profile", "fast", "--format", "las", "-q")
+    for path in (strip, cloud):
+        with path.open("r+b") as file:
+            file.seek(107 if path == strip else 247)
+            few = int.from_bytes(file.read(4), "little") - 50
+            file.seek(-4, 1)
+            file.write(few.to_bytes(4, "little"))
+    line = "the header claims .* which leaves room for 50 more"
+    for words in (
+        "plot histogram out/a.las --column amplitude -o a.png", "compare out/a.las out/a.las",
+        "compare --strip a.las fast balanced", "plot waveform a.las -o b.png", "synthesize out/a.las -o c.las",
+    ):  # fmt: skip
+        said = succeed(*(tmp_path / word if word[-4:-3] == "." else word for word in words.split())).stderr
+        assert re.search(f"warning: .*{line}", said), (words, said)
+    assert re.search(line, succeed("info", cloud).stdout)
+
+
+def test_a_point_at_the_limit_of_the_integers_is_flagged(tmp_path, edit_points):
+    """It failed its strip, because an echo beside it cannot be stored."""
+    simulate_strip("flat", tmp_path / "a.las", pulses=300, seed=1)
+    edges = {5: ("X", -(2**31)), 9: ("Z", 2**31 - 1), 14: ("Y", 2**30)}
+
+    def damage(points):
+        for row, (axis, value) in edges.items():
+            points[axis][row] = value
+
+    edit_points(tmp_path / "a.las", tmp_path / "b.las", damage)
+    said = succeed("run", tmp_path / "b.las", "-o", tmp_path / "out", "--profile", "fast").stderr
+    assert "warning: 2 points (first: point 5) with coordinates at the limit of the file's integers" in said
+    report = json.loads((tmp_path / "out" / "b.report.json").read_text())
+    assert report["counts"]["points_broken"] == 2
+    cloud = laspy.read(tmp_path / "out" / "b.laz")
+    first, second = cloud.points[np.asarray(cloud["echo_flags"]) & int(EchoFlag.BROKEN_PACKET) > 0]
+    assert (first.X, second.Z) == (-(2**31), 2**31 - 1)
+    assert np.count_nonzero(np.abs(cloud.Y - 2**30) < 10_000)  # far off, but it has room for echoes
 
 
 @pytest.mark.slow

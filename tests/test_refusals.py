@@ -94,6 +94,7 @@ RUNS = [
     (f"{RUN} --overwrite --resume", 2, "--overwrite and --resume exclude each other"),
     (f"{RUN} -q -v", 2, EXCLUDED),
     (f"{RUN} --attenuation 0 --visibility 9", 2, "--attenuation and --visibility exclude"),
+    (f"{RUN} --profile fast --visibility 9", 2, "--visibility: chain profile fast computes nothing from it"),
     (f"{RUN} --survey flight --system system.toml", 2, EXCLUDED),
     (f"{RUN} --memory 12M", 2, "too little"),
     (f"{RUN} --memory 10", 2, "10 bytes is too little, one job needs 350 MB; write for example 500M"),

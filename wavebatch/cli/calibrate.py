@@ -64,6 +64,7 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
     from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_targets
     from wavebatch.tools.api import find_request, read_sensor
+    from wavebatch.tools.cells import doubt_clouds
     from wavebatch.tools.sheets.survey import calibration_page, calibration_sheet
 
     if (targets is None) == (options["column"] is None):
@@ -94,7 +95,7 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
     if report is not None:
         write_text(report, format_json(figures) + "\n", overwrite=overwrite)
     answer(figures)
-    for note in found.notes:
+    for note in (*found.notes, *doubt_clouds(paths)):
         talk(f"warning: {note}")
     for line in list_lines(calibration_sheet(flight)):
         tell(line)

@@ -27,7 +27,7 @@ from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
 from wavebatch.files.toml_file import describe_record
 from wavebatch.tools import return_stats as returns
-from wavebatch.tools.cells import name_recordings
+from wavebatch.tools.cells import doubt_clouds
 from wavebatch.tools.raster import ForestOptions, GridOptions, write_grid
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv, list_facts
 
@@ -205,9 +205,9 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     forest = shared.from_options(ForestOptions, options) if options["forest"] else None
     how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options), forest=forest)
     found = write_grid(paths, output, how, overwrite=options["overwrite"])
-    layout, mixed = found.layout, name_recordings(paths, columns)
-    if mixed:
-        talk(f"warning: {mixed}")
+    layout = found.layout
+    for line in doubt_clouds(paths, columns):
+        talk(f"warning: {line}")
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
     if found.unnamed:

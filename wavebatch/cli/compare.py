@@ -22,6 +22,7 @@ from wavebatch.core.units import count
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
+from wavebatch.tools.cells import doubt_clouds
 from wavebatch.tools.pairing import Comparison, compare_clouds, compare_truth
 from wavebatch.tools.sheets.sheet import Fact, Later, Note, Part, Picture, Sheet, Table, format_csv, sum_table
 
@@ -107,6 +108,8 @@ def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **
         write_text(output, format_csv(HEAD, list_rows(result.to_json())), overwrite=options["overwrite"])
     parts = [*_list_parts(between), *chains]
     answer(result.to_json(), Sheet("compare", parts), "chains" if strip else "")
+    for line in doubt_clouds([Path(side) for side in (a, b, strip) if side]):
+        talk(f"warning: {line}")
     fewer = min(between.echoes_a, between.echoes_b)
     if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
         common = f"{between.matched} of {fewer} echoes" if between.matched else "no echo"

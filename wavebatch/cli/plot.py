@@ -45,13 +45,12 @@ def draws_clouds(
             paths = find(clouds, options)
             check_picture(output, overwrite=options["overwrite"])
             text, found = draw(paths, output, options)
-            from wavebatch.tools.cells import name_recordings
+            from wavebatch.tools.cells import doubt_clouds
 
             # Of several lines each is of one cloud; segments and voxels have no counts.
             columns = [options["column"]] if options.get("column") and not options.get("each") else []
-            mixed = name_recordings(paths, columns) if paths[0].suffix.lower() in (".las", ".laz") else ""
-            if mixed:
-                talk(f"warning: {mixed}")
+            for line in doubt_clouds(paths, columns):
+                talk(f"warning: {line}")
             tell(f"{output}: {text}")
             answer({"output": str(output), "clouds": [str(path) for path in paths], **found})
 
@@ -365,6 +364,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.prepare import Positions, prepare
     from wavebatch.tools.api import find_request
+    from wavebatch.tools.cells import doubt_clouds
     from wavebatch.tools.plots.waveform import Wanted, add_ranges, describe_step, find_places, format_echoes, read_views
 
     tabular = output.suffix.lower() == ".csv"
@@ -405,6 +405,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
             draw_waveform_sheet(views, output, times=shown, **more)
         else:
             draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
+    for line in doubt_clouds([strip]):
+        talk(f"warning: {line}")
     echoes = sum(len(view.echoes) for view in views)
     tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
     answer({"output": str(output), "chain": name, "waveforms": len(views), "echoes": echoes})

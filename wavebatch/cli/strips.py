@@ -23,6 +23,7 @@ from wavebatch.cli.messages import answer, counting, print_summary, talk, tell
 from wavebatch.core.schema import declared_options
 from wavebatch.core.units import count
 from wavebatch.tools import simulate as simulation
+from wavebatch.tools.cells import doubt_clouds
 from wavebatch.tools.export_strip import SUFFIXES as WRITTEN
 from wavebatch.tools.export_strip import ExportSummary, export_strip
 from wavebatch.tools.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
@@ -243,6 +244,8 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     settings = shared.from_options(SynthesisOptions, options, radar=radar)
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
+    for line in doubt_clouds([cloud]):
+        talk(f"{output}: warning: {line}")
     lines = _list_lines(output, summary, settings)
     print_summary(summary.to_json() if options["as_json"] else summary, lines)
 

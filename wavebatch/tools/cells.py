@@ -29,6 +29,7 @@ from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
 from wavebatch.files.las.header import read_header
+from wavebatch.files.las.read_points import read_checked_header
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
@@ -146,9 +147,16 @@ class Clouds:
         return InputError(f"{where}: nothing to draw: {' and '.join(reasons)}")
 
 
-def name_recordings(paths: Sequence[Path], columns: Sequence[str]) -> str:
-    """Say that columns in counts do not compare, where clouds are of strips with other bits or spacing; else empty."""
-    counts = [facts.name for facts in Clouds(paths, columns).every if "DN" in facts.unit.split()] if columns else []
+def doubt_clouds(paths: Sequence[Path], columns: Sequence[str] = ()) -> Iterator[str]:
+    """Yield a line for each cloud that seems to hold points that are not read, and for columns that do not compare.
+
+    Columns in counts do not, where the strips of the clouds have other bits or spacing.
+    """
+    paths = [path for path in paths if path.suffix.lower() in (".las", ".laz")]
+    for path in paths:
+        yield from (f"{path}: {line}" for line in read_checked_header(path, waveforms=False).unread)
+    named_by = Clouds(paths, columns).every if columns and paths else ()
+    counts = [facts.name for facts in named_by if "DN" in facts.unit.split()]
     ways: dict[str, Path] = {}
     for path in paths if counts else ():
         for run in read_provenance(read_header(path))[-1:]:
@@ -158,7 +166,8 @@ def name_recordings(paths: Sequence[Path], columns: Sequence[str]) -> str:
             if all(isinstance(value, int | float) for value in way):
                 ways.setdefault("{:g} bits, {:g} ns apart".format(*way), path)
     named = " and ".join(f"{path} ({way})" for way, path in [*ways.items()][:2])
-    return f"{', '.join(counts)}: counts of {named} do not compare; take a calibrated column" * (len(ways) > 1)
+    if len(ways) > 1:
+        yield f"{', '.join(counts)}: counts of {named} do not compare; take a calibrated column"
 
 
 def sample_points(

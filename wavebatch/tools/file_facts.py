@@ -34,7 +34,8 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
     """
     checked = read_checked_header(path, waveforms=False)
     header = checked.header
-    facts: dict[str, Any] = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
+    facts: dict[str, Any] = {"file": str(path), "bytes": header.file_size, "problems": [],
+                             "warnings": list(checked.warnings), "notes": []}  # fmt: skip
     if header.point_format in las.WITHOUT_WAVES and header.version >= (1, 3):
         facts |= _describe_waveforms(path, direction, headerless)
     evlrs, _ = las.find_evlrs(path, header, 1000)

@@ -114,10 +114,10 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
         if more := (room - points_end) // header.point_length:
             # A program that was stopped writes its points, but not their number.
             unread = (f"the header claims {header.point_count} points, which leaves room for {more} more before "
-                      f"{limit}; what is there is not read: if points are missing, get the strip again",)  # fmt: skip
+                      f"{limit}; what is there is not read: if points are missing, get the file again",)  # fmt: skip
     elif (returns := sum(header.by_return)) > header.point_count:  # the size of the last chunk does not say how many
         unread = (f"the header claims {header.point_count} points, but {returns} by return number; no more are "
-                  "read: if points are missing, get the strip again",)  # fmt: skip
+                  "read: if points are missing, get the file again",)  # fmt: skip
     warnings = unread
     legacy, count = header.counts
     if header.version >= (1, 4) and legacy and legacy != count:
