@@ -66,6 +66,9 @@ _READ = ["{base}", "{base}/strip.las", "{base}/cloud.laz", "{base}/truth.npz", "
          "{base}/chain.toml", "{base}/targets.csv", "{base}/trajectory.txt", "{base}/beside.wdp", "{base}/cube.npz",
          "{base}/voxels.npz", "{base}/polygons.geojson", "{base}/strip.pls"]  # fmt: skip
 
+_WRITTEN = [place for place in _PLACES if "{base}" not in place]
+"""Outputs may replace other files, but not the sound inputs of all cases."""
+
 _NEVER = ("debug", "scheduler", "help", "against", "real", "promises", "large", "all_methods", "peers", "stability")
 """Print tracebacks, wait for a network, or take minutes by design."""
 
@@ -101,7 +104,7 @@ class Options:
         ]
         if rng.random() < 0.15 and len(words) > len(name.split()):
             place = rng.randrange(len(name.split()), len(words))
-            words[place] = rng.choice([*_PLACES, *_READ])
+            words[place] = rng.choice(_WRITTEN if words[place - 1] == "-o" else [*_PLACES, *_READ])
         for option in rng.sample(options, min(rng.choice([1, 1, 2, 3, 5]), len(options))):
             words = self._drop_rivals(words, name, option)
             value = (draw_value(option, rng) or "").replace("\0", "") if not option.is_flag else None
@@ -112,6 +115,8 @@ class Options:
             else:
                 words.append(rng.choice([*option.opts, *option.secondary_opts]))
                 words += [] if value is None else [value]
+        if name == "import" and not {"-o", "--output"} & set(words):  # it would write beside the sound inputs
+            words += ["-o", "{out}/a.las"]
         return shlex.join(words), variables
 
 
@@ -139,8 +144,8 @@ def draw_value(option: click.Option, rng: random.Random) -> str | None:
         return rng.choice(["-1", "1", "2", "", "nan", "1.5", "one"])
     if name in _MANY:
         return rng.choice(_FEW)
-    if isinstance(kind, OutputPath):  # outputs may replace other files, but not the sound inputs of all cases
-        return rng.choice([place for place in _PLACES if "{base}" not in place])
+    if isinstance(kind, OutputPath):
+        return rng.choice(_WRITTEN)
     if isinstance(kind, click.Path):
         return rng.choice([*_PLACES, *_READ, *_READ])
     if name in _TEXTS:
