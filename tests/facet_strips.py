@@ -6,11 +6,13 @@ pulse widths, edges and mixed targets come out of geometry, not out of the formu
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from strips import write_positions
 
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.las.header import ExtraRecord
@@ -93,11 +95,35 @@ def path_of(sensor: Sensor, seconds: np.ndarray) -> np.ndarray:
 def write_trajectory(path: Path, sensor: Sensor, duration: float, lower: float = 0.0) -> Path:
     """The sensor's positions as a text file, `lower` metres too low."""
     seconds = np.arange(-2.0, duration + 2.0, 0.05)
-    xyz = path_of(sensor, seconds) + [EAST, NORTH, -lower]
-    rows = np.column_stack([sensor.time + seconds, xyz])
-    text = "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows)
-    path.write_text("time,x,y,z\n" + text)
+    return write_positions(path, sensor.time + seconds, path_of(sensor, seconds) + [EAST, NORTH, -lower])
+
+
+def fields(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Fields of 20 m with reflectances of 0.1 to 0.6."""
+    i, j = np.floor(x / 20), np.floor(y / 20)
+    return 0.1 + 0.5 * np.abs(np.sin(12.9898 * i + 78.233 * j) * 43758.5453 % 1.0)
+
+
+TARGET = Facet(0.3, inside=box(40, 0, 60, 20))
+"""A field of known reflectance."""
+FARMLAND = [TARGET, Facet(fields)]
+
+
+def write_field(path: Path, more: str = "") -> Path:
+    """The target as a file; more: a further column and its value, as in "incidence=3"."""
+    x0, y0 = EAST + 41, NORTH + 1
+    corners = f"{x0} {y0} {x0 + 18} {y0} {x0 + 18} {y0 + 18} {x0} {y0 + 18}"
+    name, value = more.split("=") if more else ("", "")
+    path.write_text(f"name,reflectance,vertices{more and ',' + name}\nfield,0.3,{corners}{more and ',' + value}\n")
     return path
+
+
+def compare_fields(cloud: np.ndarray, reflectance: np.ndarray, border: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectances of points over those of their fields, less 1, and which of them are no nearer to a border (n,)."""
+    x, y = cloud["x"] - EAST, cloud["y"] - NORTH
+    true = np.where(TARGET.inside(x, y), TARGET.reflectance, fields(x, y))
+    inside = (np.abs(x % 20 - 10) < 10 - border) & (np.abs(y % 20 - 10) < 10 - border)
+    return reflectance / true - 1, inside & np.isfinite(reflectance)
 
 
 @dataclass
@@ -216,7 +242,7 @@ def render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarray
 
 
 def write_pulses(path, sensor, stored, seconds, channel, samples, energy) -> None:
-    origin, ray, first, hit, facing = (getattr(stored, one.name) for one in fields(stored))
+    origin, ray, first, hit, facing = (getattr(stored, one.name) for one in dataclasses.fields(stored))
     indices = [1] if sensor.scanners else list(sensor.gains)
     digitizers = [
         Digitizer(index, sensor.bits, sensor.n_samples, sensor.spacing, sensor.descriptor_gain) for index in indices

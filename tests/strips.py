@@ -11,10 +11,25 @@ import numpy as np
 
 from wavebatch.files.las.header import STANDARD_DTYPES, Vlr, read_header
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.tools.simulate.render import AIR_SPEED, START_TIME, FlightLine, trace_rays
 
 HEADER_SIZES = {3: 235, 4: 375, 5: 393}
 TOWARD = np.array([0.02, -0.01, 0.148]) / 1000.0
 """Vector of every pulse toward the sensor [m/ps], 0.9997 of c/2 long or so."""
+
+
+def true_sensor(time: np.ndarray, flight: FlightLine | None = None) -> np.ndarray:
+    """Position of the sensor of simulated strips (n, 3) at GPS times (n,)."""
+    flight = flight or FlightLine()
+    rays = trace_rays(flight, "flat", (time - START_TIME) * flight.pulse_rate)
+    return rays.ground - rays.direction / AIR_SPEED * rays.distance[:, None]
+
+
+def write_positions(path: Path, time: np.ndarray, xyz: np.ndarray, names: str = "time,x,y,z") -> Path:
+    """A trajectory as text: times (n,) and positions (n, 3), or (n, 6) with three angles."""
+    rows = np.column_stack([time, xyz])
+    path.write_text("\n".join([names, *(",".join(f"{value:.6f}" for value in row) for row in rows)]) + "\n")
+    return path
 
 
 def vlr(user: bytes, record_id: int, payload: bytes, reserved: int = 0) -> bytes:

@@ -9,14 +9,13 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command, succeed
-from strips import take_turns
+from strips import take_turns, true_sensor, write_positions
 
-from wavebatch.core.units import HALF_C
 from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.flat_ground import GroundReference
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import START_TIME
 
 FOUND = Calibration(2.6e-8, 0.02, 0.3, divergence=1.1, strip="strip.laz", date="2026-11-21",
                     conditions="said by a test")  # fmt: skip
@@ -128,13 +127,9 @@ def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
     assert remark in quiet.stderr and "no-data for" not in quiet.stderr
 
 
-def write_trajectory(path):
-    time = START_TIME + np.arange(-1.0, 2.0, 0.05)
-    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * FlightLine().pulse_rate)
-    sensor = rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
-    rows = np.column_stack([time, sensor])
-    path.write_text("time,x,y,z\n" + "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows))
-    return path
+def write_trajectory(path, first=-1.0, last=2.0, step=0.05):
+    time = START_TIME + np.arange(first, last, step)
+    return write_positions(path, time, true_sensor(time))
 
 
 @pytest.mark.slow
@@ -225,14 +220,8 @@ def test_relative_columns_are_written_on_request_and_say_so_in_the_file(tmp_path
 @pytest.mark.quick_cases("-1.0-0.25-55")
 @pytest.mark.parametrize(("first", "last", "share"), [(-1.0, 0.25, 55), (0.1, 3.0, 18), (-1.0, 0.7, 0)])
 def test_a_trajectory_that_does_not_cover_the_strip_is_told_with_counts(tmp_path, wide_strip, first, last, share):
-    time = START_TIME + np.arange(first, last + 1e-9, 0.0005)
-    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * FlightLine().pulse_rate)
-    sensor = rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
-    rows = np.column_stack([time, sensor])
-    lines = [",".join(map(repr, row)) for row in rows.tolist()]
-    (tmp_path / "t.csv").write_text("\n".join(["time,x,y,z", *lines]))
-    out = tmp_path / "out"
-    done = succeed("run", wide_strip, "-o", out, "--profile", "fast", "--trajectory", tmp_path / "t.csv")
+    path, out = write_trajectory(tmp_path / "t.csv", first, last + 1e-9, 0.0005), tmp_path / "out"
+    done = succeed("run", wide_strip, "-o", out, "--profile", "fast", "--trajectory", path)
     lines = [line for line in done.stderr.splitlines() if "has no position" in line]
     (ranges,) = columns(out, "range")
     if not share:

@@ -119,6 +119,13 @@ def test_report_and_provenance_say_how_the_cloud_was_made(riegl, tmp_path):
         assert made[key] == expected, key
 
 
+def test_small_strips_are_worked_on_beside_each_other(tiny_strip, tmp_path):
+    names, events = ("a.las", "b.las", "c.las"), []
+    jobs = [make_job(shutil.copy(tiny_strip, tmp_path / name)) for name in names]
+    run_batch(jobs, RunOptions(tmp_path / "out", jobs=2), events.append)
+    assert [event["event"] for event in events[:2]] == ["start", "start"]
+
+
 def test_one_bad_strip_does_not_stop_the_others(tiny_strip, tmp_path):
     broken = tmp_path / "broken.las"
     broken.write_bytes(tiny_strip.read_bytes()[:1000])

@@ -52,6 +52,16 @@ def list_models(receiver):
     return systems
 
 
+@pytest.mark.parametrize("echoes", [100, 400])
+def test_errors_of_a_stack_are_those_of_medians(rng, echoes):
+    """Noise of 1 on echoes of 100, in bins of a quarter of a sample or so."""
+    time = rng.uniform(40, 41, echoes)
+    stack = stack_pulse(rng.standard_normal((echoes, 120)), np.full(echoes, 100.0), time, 12, 40)
+    each = echoes * (12 + 40) / len(stack.value)
+    assert np.median(stack.error) == pytest.approx(np.sqrt(np.pi / 2) * 0.01 / np.sqrt(each), rel=0.1)
+    assert np.std(stack.value / stack.error) == pytest.approx(1.0, abs=0.15)
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.5, 2.5])
 @pytest.mark.parametrize("receiver", RECEIVERS)
 def test_models_of_one_pulse_give_one_time_at_every_width(receiver, factor):

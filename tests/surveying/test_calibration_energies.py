@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import wavebatch as wb
-from tests.facet_strips import EAST, NORTH, START, Sensor, write_strip
-from tests.surveying.test_calibration_misuse import BASE, GROUND, LIGHT, call, fields, write_targets
+from tests.facet_strips import FARMLAND, START, Sensor, compare_fields, write_field, write_strip
+from tests.surveying.test_calibration_misuse import BASE, LIGHT, call
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
 from wavebatch.surveying.matching.strip_energies import _compare_unknown
 
@@ -23,8 +23,8 @@ COLUMNS = "level_reflectance,backscatter_coefficient,backscatter_coefficient_err
 def flickering(tmp_path_factory):
     """A strip whose shots scatter by 6 %, and its calibration with and without their energies."""
     folder = tmp_path_factory.mktemp("energies")
-    write_strip(folder / "a.las", GROUND, FLICKERS, 8000, seed=1)
-    write_targets(folder / "t.csv")
+    write_strip(folder / "a.las", FARMLAND, FLICKERS, 8000, seed=1)
+    write_field(folder / "t.csv")
     for name, more in (("with", ()), ("without", ("--energy", "none"))):
         done = call("calibrate", folder / "a.las", "--targets", folder / "t.csv", "-o", folder / f"{name}.toml",
                     "--divergence", 0.4, *more)  # fmt: skip
@@ -37,13 +37,9 @@ def judge(out, strip, calibration, *options):
     done = call("run", strip, "-o", out, "--calibration", calibration, "--columns", COLUMNS, *options)
     assert done.exit_code == 0, done.output
     cloud = wb.read_cloud(out / f"{strip.stem}.laz")
-    x, y = cloud["x"] - EAST, cloud["y"] - NORTH
-    inside = (np.abs(x % 20 - 10) < 9) & (np.abs(y % 20 - 10) < 9)
-    target = (x >= 40) & (x < 60) & (y >= 0) & (y < 20)
-    inside &= np.isfinite(cloud["level_reflectance"])
-    off = (cloud["level_reflectance"] / np.where(target, 0.3, fields(x, y)) - 1)[inside]
-    stated = (cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])[inside]
-    return off, stated, done.stderr
+    off, inside = compare_fields(cloud, cloud["level_reflectance"])
+    stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
+    return off[inside], stated[inside], done.stderr
 
 
 def write_log(path, strip, change):
@@ -59,7 +55,7 @@ def test_a_weaker_laser_that_its_log_knows_is_right(tmp_path, flickering):
     found = load_calibration(flickering / "with.toml")
     assert found.energy_mean == pytest.approx(1.0, abs=0.005) and found.energy_source == "pulse_energy"
     assert found.energy_spread == pytest.approx(0.06, rel=0.05)
-    write_strip(tmp_path / "weak.las", GROUND, replace(FLICKERS, gains={1: 0.8}, time=START + 600), 5000, seed=2)
+    write_strip(tmp_path / "weak.las", FARMLAND, replace(FLICKERS, gains={1: 0.8}, time=START + 600), 5000, seed=2)
     off, stated, said = judge(tmp_path / "out", tmp_path / "weak.las", flickering / "with.toml")
     # Other air within the day is in the error: ground in common shows it to 2 %.
     assert abs(np.median(off)) < 0.01 and np.median(stated) < 0.038 and "energ" not in said
@@ -116,7 +112,7 @@ def test_logs_that_stand_still_or_drift_alone_are_named_and_in_the_error(tmp_pat
 def test_pulses_whose_energy_is_not_logged_have_an_error_by_their_light(tmp_path, flickering, rng, weak, error):
     """They counted as of mean energy: a laser that was 25 % weaker there had 5 % of error, in silence."""
     gone = rng.uniform(size=8000) < 0.4
-    strip = write_strip(tmp_path / "s.las", GROUND, replace(FLICKERS, time=START + 600), 8000, seed=6,
+    strip = write_strip(tmp_path / "s.las", FARMLAND, replace(FLICKERS, time=START + 600), 8000, seed=6,
                         light=lambda seconds: np.where(gone, weak, 1.0))  # fmt: skip
     content = bytearray(strip.read_bytes())
     (begin,), (length,) = struct.unpack_from("<I", content, 96), struct.unpack_from("<H", content, 105)
@@ -145,13 +141,13 @@ def test_light_of_unknown_pulses_is_compared_within_each_digitizer(rng):
 @pytest.mark.slow
 def test_two_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tmp_path, flickering):
     plain = replace(FLICKERS, store_energy=False)
-    write_strip(tmp_path / "two.las", GROUND, replace(plain, energy_spread=0.02), 8000, seed=4,
+    write_strip(tmp_path / "two.las", FARMLAND, replace(plain, energy_spread=0.02), 8000, seed=4,
                 light=lambda seconds: np.where(np.arange(len(seconds)) % 2, 0.7, 1.0))  # fmt: skip
     off, stated, line = judge(tmp_path, tmp_path / "two.las", flickering / "without.toml")
     assert "alternates by a factor of 0.70, as of two lasers" in line
     assert abs(np.mean(off)) < np.median(stated) and np.median(stated) > 0.24
     two = Sensor(**BASE, light=LIGHT, gains={1: 1.0, 2: 0.45})
-    write_strip(tmp_path / "channels.las", GROUND, two, 4000, seed=5)
+    write_strip(tmp_path / "channels.las", FARMLAND, two, 4000, seed=5)
     calibrate = ("calibrate", tmp_path / "channels.las", "--targets", flickering / "t.csv", "-o", tmp_path / "c.toml")
     done = call(*calibrate)
     assert done.exit_code == 0 and "alternates" not in done.stderr
@@ -160,7 +156,7 @@ def test_two_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tm
 @pytest.mark.slow
 def test_strips_of_a_flight_are_calibrated_with_one_unit_of_energy(tmp_path, flickering):
     b = replace(FLICKERS, gains={1: 0.8}, start=(98, 100), heading=270.0, time=START + 600)
-    write_strip(tmp_path / "b.las", GROUND, b, 8000, seed=12)
+    write_strip(tmp_path / "b.las", FARMLAND, b, 8000, seed=12)
     done = call("calibrate", flickering / "a.las", tmp_path / "b.las", "--targets", flickering / "t.csv",
                 "-o", tmp_path / "cal.toml")  # fmt: skip
     assert done.exit_code == 0, done.output

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import refuses, succeed
 from facet_strips import EAST, NORTH, START, Facet, Sensor, path_of, write_strip
+from strips import true_sensor, write_positions
 
 import wavebatch as wb
 from wavebatch.core.errors import InputError
@@ -33,11 +34,6 @@ from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 def find(path, **request):
     with StripReader(path) as reader, reader.scan() as scan:
         return find_sensor(reader, scan, SensorRequest(**request))
-
-
-def true_sensor(gps_time):
-    rays = trace_rays(FlightLine(), "flat", (gps_time - START_TIME) * FlightLine().pulse_rate)
-    return rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +107,7 @@ def test_every_waveform_of_a_real_file_has_a_sensor(request, name):
 
 def write_trajectory(path, shift=0.0, off=(0.0, 0.0, 0.0), clock=0.0, stop=3.0):
     time = START_TIME + np.arange(-1.0, stop, 0.05)
-    rows = np.column_stack([time + shift + clock, true_sensor(time) + off])
-    path.write_text("gps_time,x,y,z\n" + "\n".join(",".join(f"{v:.6f}" for v in row) for row in rows) + "\n")
-    return path
+    return write_positions(path, time + shift + clock, true_sensor(time) + off, "gps_time,x,y,z")
 
 
 def test_a_trajectory_file(tmp_path, wide_strip, found):

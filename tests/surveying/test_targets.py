@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from commands import fail, succeed
 from commands import run_command as call
+from strips import true_sensor, write_positions
 
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.files.strip.reader import StripReader
@@ -21,7 +22,7 @@ from wavebatch.surveying.calibrating.calibration_files import (
     parse_calibration,
 )
 from wavebatch.tools.simulate import find_scene, simulate_strip, strip
-from wavebatch.tools.simulate.render import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import EAST, GROUND, NORTH, START_TIME
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
 
 pytestmark = pytest.mark.kept_surveys
@@ -120,15 +121,11 @@ def test_targets_off_the_strip(tmp_path, ground):
 
 
 def test_a_lever_arm_leads_from_the_trajectory_to_the_scanner(tmp_path, ground):
-    flight = FlightLine()
-    seconds = np.arange(-1.0, 2.0, 0.05)
-    rays = trace_rays(flight, "flat", seconds * flight.pulse_rate)
-    sensor = rays.ground - rays.direction / AIR_SPEED * rays.distance[:, None]
+    time = START_TIME + np.arange(-1.0, 2.0, 0.05)
     # Heading east, the trajectory's antenna is 30 m above the scanner and 2 m behind it.
-    antenna = sensor + [-2.0, 0.0, 30.0]
-    rows = np.column_stack([START_TIME + seconds, antenna, np.tile([0.0, 0.0, 90.0], (len(seconds), 1))])
-    text = "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows)
-    (tmp_path / "t.csv").write_text("time,x,y,z,roll,pitch,heading\n" + text)
+    antenna = true_sensor(time) + [-2.0, 0.0, 30.0]
+    turned = np.tile([0.0, 0.0, 90.0], (len(time), 1))
+    write_positions(tmp_path / "t.csv", time, np.hstack([antenna, turned]), "time,x,y,z,roll,pitch,heading")
     cloud = laspy.read(ground)
     target = f"reflectance,x,y,radius\n0.2,{np.median(cloud.x)},{np.median(cloud.y)},40\n"
     (tmp_path / "g.csv").write_text(target)

@@ -8,12 +8,20 @@ import numpy as np
 import pytest
 from commands import succeed as call
 from helpers_scenes import make_scene
+from strips import true_sensor, write_positions
 
 from wavebatch.core.waveforms import Radiometry, SystemPulse
 from wavebatch.surveying import survey_block
-from wavebatch.surveying.flat_ground import LEAST_NEIGHBOURS, GroundReference, Slopes, choose_radius, measure_reference
+from wavebatch.surveying.flat_ground import (
+    LEAST_NEIGHBOURS,
+    RADII,
+    GroundReference,
+    Slopes,
+    choose_radius,
+    measure_reference,
+)
 from wavebatch.tools.simulate import find_scene, simulate_strip
-from wavebatch.tools.simulate.render import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT, simulate_seed_block
 
 SCENE = find_scene("village")
@@ -32,6 +40,7 @@ def test_the_radius_of_neighbourhoods_holds_enough_points(tmp_path):
     xyz = laspy.read(tmp_path / "v.las").xyz
     apart = np.sort(np.linalg.norm(xyz[:, None] - xyz, axis=2), axis=1)[:, LEAST_NEIGHBOURS * 3 // 2 - 1]
     assert choose_radius(xyz) == pytest.approx(np.ceil(10 * np.quantile(apart, 0.9)) / 10)
+    assert choose_radius(100 * xyz) == RADII[1], "as large as it may be, where too few are near"
 
 
 def write_targets(path, strip):
@@ -44,11 +53,7 @@ def write_targets(path, strip):
 
 def write_trajectory(path, stop):
     time = START_TIME + np.arange(-1.0, stop + 1.0, 0.05)
-    rays = trace_rays(SCENE.flight, "flat", (time - START_TIME) * SCENE.flight.pulse_rate)
-    sensor = rays.ground - rays.direction / AIR_SPEED * rays.distance[:, None]
-    rows = np.column_stack([time, sensor])
-    path.write_text("time,x,y,z\n" + "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows))
-    return path
+    return write_positions(path, time, true_sensor(time, SCENE.flight))
 
 
 def fly(folder, seed, pulses):
