@@ -273,9 +273,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     if found is not None:
         return replace(found, facts=(*found.facts, *facts.items()))
     if len(vectors.time) >= LEAST_RAYS and vectors.time[0] < vectors.time[-1]:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
-        spread = ray_convergence.measure_extent(unit)
+        spread = ray_convergence.measure_extent(_unit(vectors.direction))
         if not LEAST_TURN < spread <= LEAST_SPREAD:
             facts["do_not_meet_deg"] = round(float(np.degrees(spread)), 1)
             # Unless pairs of returns prove them, such vectors may be off by as much as they scatter, or by anything.
@@ -502,8 +500,7 @@ def find_turn(
         error = np.linalg.inv(known + np.eye(3) / (MOUNTING**2 + turn @ turn))
         turn = error @ (right + side)
     error = error if moved else np.linalg.inv(known + np.eye(3) * (2.0 / MOUNTING) ** 2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
+    unit = _unit(vectors.direction)
     unit = unit[np.isfinite(unit[:, 0])]
     across = np.eye(3) - unit.T @ unit / max(len(unit), 1)
     angle, doubt = float(np.sqrt(turn @ across @ turn)), float(np.sqrt(0.5 * np.sum(across * error)))
@@ -515,12 +512,18 @@ def find_turn(
     return facts, turn * moved, off
 
 
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """The vectors (n, 3) with a length of 1; NaN for those without a length."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return vectors / np.sqrt((vectors**2).sum(axis=1))[:, None]
+
+
 def _turn_by_pairs(pairs: RaySample) -> tuple[np.ndarray, np.ndarray]:
     """Information of a turn and its right side, (3, 3) and (3,), by vectors across the ray between two returns."""
     with np.errstate(invalid="ignore", divide="ignore"):
         long = np.sqrt(pairs.weight)
         ray = pairs.direction / long[:, None]
-        vector = pairs.vector / np.sqrt((pairs.vector**2).sum(axis=1))[:, None]
+        vector = _unit(pairs.vector)
         ray = ray * np.sign(np.einsum("ni,ni->n", vector, ray))[:, None]
         off = (vector - ray) * long[:, None]
     rows = np.isfinite(off).all(axis=1) & ((off * off).sum(axis=1) < (LARGEST_ANGLE * long) ** 2)
@@ -532,10 +535,8 @@ def _turn_by_pairs(pairs: RaySample) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(3):
         size = np.sqrt((left * left).sum(axis=1))
         good = size <= ray_convergence.CLIP * max(float(median(size)), 1e-12)
-        normal, right = (
-            np.einsum("nki,nkj->ij", turns[good], turns[good]),
-            np.einsum("nki,nk->i", turns[good], off[good]),
-        )
+        normal = np.einsum("nki,nkj->ij", turns[good], turns[good])
+        right = np.einsum("nki,nk->i", turns[good], off[good])
         left = off - turns @ (np.linalg.pinv(normal, hermitian=True) @ right)
     variance = max(float((left[good] ** 2).sum()) / max(2 * int(good.sum()) - 3, 1), 1e-12)
     return normal / variance, right / variance
@@ -547,8 +548,7 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
     """
     with np.errstate(all="ignore"):
         ahead = ahead / distance[:, None]
-        unit = rays.direction / np.sqrt((rays.direction**2).sum(axis=1))[:, None]
-        cosine = np.clip(np.einsum("ni,ni->n", ahead, unit), -1.0, 1.0)
+        cosine = np.clip(np.einsum("ni,ni->n", ahead, _unit(rays.direction)), -1.0, 1.0)
     known = np.isfinite(cosine)
     if not known.any():
         return 0.0
@@ -633,8 +633,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     squares, apart = [], []
     for number, (fit, _, within) in enumerate(found):
         near = np.abs(rays.time - fit.centre) <= fit.half
-        direction = rays.direction[near][:64]
-        direction = direction / np.sqrt((direction**2).sum(axis=1))[:, None]
+        direction = _unit(rays.direction[near][:64])
         at = np.full(len(direction), within[len(within) // 2])
         squares.append(np.mean(ray_convergence.range_error(fit, at, direction) ** 2))
         later = found[number + 1][0] if number + 1 < len(found) else None
@@ -650,7 +649,7 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     else:
         motion = (JERK * JERK_LEFT * max(fit.half for fit, _, _ in found) ** 3) ** 2
     sure = rays.weight >= median(rays.weight)
-    unit = rays.direction[sure] / np.sqrt((rays.direction[sure] ** 2).sum(axis=1))[:, None]
+    unit = _unit(rays.direction[sure])
     miss = np.sqrt(np.square(np.cross(rays.point[sure] - path.at(rays.time[sure]), unit)).sum(axis=1))
     above = _measure_heights(rays.point[sure] - path.at(rays.time[sure]), unit)
     above *= above > LEAST_HEIGHTS * distance
