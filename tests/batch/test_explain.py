@@ -57,6 +57,17 @@ def test_return_locations_that_are_not_those_of_echoes_are_doubted(tiny_strip, t
     assert "returns lie where their packet has an echo: the return locations" in line and "picoseconds" in line
 
 
+def test_points_that_stand_twice_in_the_file_are_one_of_the_reasons(tiny_strip, tmp_path, edit_points):
+    """Half of the returns had no echo of their own, and only wrong locations were named."""
+
+    def treble(points):
+        number = len(points) // 3
+        points[number : 2 * number] = points[2 * number : 3 * number] = points[:number]
+
+    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "twice.las", treble), tmp_path)
+    assert "returns lie where their packet has an echo" in line and line.endswith("or points stand in the file twice")
+
+
 def test_packets_of_another_strip_warn_in_cron_too(riegl, tmp_path):
     strip = tmp_path / "mixed.las"
     shutil.copy(riegl, strip)

@@ -206,7 +206,8 @@ def doubt_packets(facts: StripFacts, matched: int, returns: int) -> Iterator[str
         other = "" if packets.file is None or packets.internal else f"{packets.file.name} belongs to another strip, or "
         yield (
             f"only {matched} of {returns} returns lie where their packet has an echo: {other}the return locations "
-            "(which should be picoseconds after the first sample) are wrong, and so are the positions of added echoes"
+            "(which should be picoseconds after the first sample) are wrong, and so are the positions of added echoes; "
+            "or points stand in the file twice"
         )
 
 

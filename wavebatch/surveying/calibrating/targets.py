@@ -171,8 +171,10 @@ EDGE_SIGMA, LEAST_EDGE, LEAST_CORE = 4.0, 0.01, 0.1
 few in the middle differ from all by the third, which no stain does: the target is smaller than its outline."""
 
 
-LEAST_NEGATIVE, MOST_REFLECTANCE = 0.01, 2.0
-"""Share of negative values from which a column of reflectances is in dB, and the most that its median may be."""
+LEAST_NEGATIVE, MOST_REFLECTANCE, BRIGHT = 0.01, 1.5, 0.1
+"""Share of negative values from which a column of reflectances is in dB; most that surfaces send back along the light:
+white ones half more than a matt one; and share of values above that from which it is no reflectance. Backscatter
+coefficients are four times as large."""
 
 MOST_HELD_ERROR = 0.3
 """Error of the share of the air that a column holds from which the share is not known: it is 0 or 1. Beyond -0.5 and
@@ -303,10 +305,12 @@ def measure_column(
     facing = 10.0 ** (0.1 * rows["given"]) if np.mean(rows["given"] < 0) > LEAST_NEGATIVE else rows["given"]
     rows, facing = rows[facing > LEAST_REFLECTANCE], facing[facing > LEAST_REFLECTANCE]
     blank = TargetResult(f"column {name}", float(np.median(facing)) if len(facing) else 0.0, len(rows))
-    if len(rows) < LEAST_ECHOES or not blank.reflectance < MOST_REFLECTANCE:
+    bright = float(np.mean(facing > MOST_REFLECTANCE)) if len(facing) else 0.0
+    if len(rows) < LEAST_ECHOES or bright > BRIGHT:
         reason = f"{len(rows)} clean single echoes have a reflectance, {LEAST_ECHOES} are needed"
         if len(rows) >= LEAST_ECHOES:
-            reason = f"its median is {blank.reflectance:.3g}: no reflectance in dB (below 0), nor as a share of 1"
+            reason = f"its median is {blank.reflectance:.3g}, {bright:.0%} exceed {MOST_REFLECTANCE:g}, as no surface "
+            reason += "does: no reflectance in dB (below 0), nor as a share of 1"
         return replace(blank, refused=reason), rows[:0], np.empty(0)
     constant, held, air_err = _take_off_air(4.0 * facing / rows["light"], rows["distance"], attenuation)
     result = replace(summarise(blank, constant), air=held)
