@@ -385,6 +385,28 @@ def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fa
     assert fade or _find_fading(time, forest, place).chance < 0.5
 
 
+@pytest.mark.parametrize("apart", [100.0, 5.0], ids=["lines", "one line"])
+@pytest.mark.parametrize("factor", [1.0, 0.8, 1.5])
+@pytest.mark.parametrize("lines", [2, 5])
+def test_one_of_several_flight_lines_in_a_file_is_named_and_in_the_error(rng, lines, factor, apart):
+    """A tile of five lines, one of them with a laser 35 % weaker: no word, and 4 % of error."""
+    line, place = np.sort(rng.integers(0, lines, 2048)), rng.uniform(0.0, 120.0, (2, 2048))
+    place[1] += 30.0 * line
+    light = np.log(fields(*place)) + rng.normal(0.0, 0.05, 2048) + np.log(factor) * (line == 1)
+    time = apart * line + rng.uniform(0.0, 3.0, 2048)
+    found = setting._compare_lines(time, light, place, chance=0.3)
+    is_seen = factor != 1.0 and apart > 10.0
+    assert (found.chance > 0.5) == is_seen
+    if is_seen:  # of two lines it is open which one is right
+        assert abs(found.shift) == pytest.approx(abs(np.log(factor)), abs=0.05)
+        strip = SimpleNamespace(fades=found, places={})
+        growth, warned, _ = judge_fading(SimpleNamespace(channels=[]), strip, other=True)
+        assert growth == pytest.approx(np.expm1(abs(np.log(factor))), rel=0.25)
+        assert "one of the flight lines in this file is" in warned[0]
+    shared = setting._compare_lines(time, light, place + 500.0 * line, chance=0.3)
+    assert shared.chance < 0.5  # lines that share no ground
+
+
 @pytest.mark.slow
 def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, calibrated):
     even = [Facet(lambda x, y: 0.1 + 0.5 * np.abs(np.sin(y)))]
@@ -683,7 +705,7 @@ def test_a_column_that_is_no_reflectance_of_the_channel_is_named(tmp_path):
 def test_a_column_of_backscatter_coefficients_is_no_reflectance(tmp_path):
     """Of a cloud of an earlier run: the constant was 4 times too large, with an error of 3 %."""
     sensor = replace(SENSOR, vendor="share")
-    write_strip(tmp_path / "s.las", GROUND, sensor, 3000, seed=90, store=lambda stored: np.multiply(
+    write_strip(tmp_path / "s.las", FARMLAND, sensor, 3000, seed=90, store=lambda stored: np.multiply(
         stored.facing, 4.0, out=stored.facing))  # fmt: skip
     fail(1, "exceed 1.5, as no surface does", "calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o",
          tmp_path / "cal.toml")  # fmt: skip

@@ -94,6 +94,9 @@ CELLS, LEAST_OF_CELL, LEAST_CELLS = (8, 32), 4, 50
 """Mean numbers of sampled waveforms of the cells in which light is compared with time; fewest of one that counts, and
 fewest such cells."""
 
+BREAK = 10.0
+"""Time without a pulse from which another flight line begins [s]: aircraft turn for longer."""
+
 BRIGHT = 0.95
 """Quantile of the light of waveforms: above it lie few metal roofs and signs."""
 
@@ -128,7 +131,8 @@ class Change(NamedTuple):
     spread: float = np.inf
     """How much surfaces change the ratio (standard deviation)."""
     is_uneven: bool = False
-    """Whether the shift is that of parts of a strip about their mean, root mean square."""
+    """Whether the shift is that of parts of a strip about their mean, root mean square; or the largest one of a flight
+    line against the others of its file."""
 
 
 NO_CHANGE = Change(0.0, 0.0, 0.0)
@@ -293,6 +297,8 @@ def measure_setting(
         off = time - 0.5 * (time.min() + time.max())
         places[channel] = np.stack([east, north, np.log(light), off / max(float(off.max()), 1e-9)])
         fading.append(_find_fading(time, light, rows[2:4], chance=chance))
+        lines = _compare_lines(time, np.log(light), rows[2:4], chance=chance)
+        fading += [lines] if lines.chance > LIKELY else []
     fades = max(fading, key=lambda one: one.error)
     right = (0.0, 0.0)  # by the mean motion of the sensor; 0 where it does not move
     if every.size:
@@ -427,13 +433,8 @@ def _find_fading(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chan
 def _find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray) -> Iterator[tuple[float, float]]:
     """Yield errors and slopes over time of light in cells of the ground of two sizes: medians over the cells, since a
     field's border in some of them says nothing."""
-    low, high = place.min(axis=1), place.max(axis=1)
     for number in CELLS:
-        size = max(float(np.sqrt(np.prod(high - low) * number / len(time))), 1e-3)
-        across, up = ((place - low[:, None]) // size).astype(np.int64)
-        _, first, cell, count = np.unique(
-            across * (up.max() + 1) + up, return_index=True, return_inverse=True, return_counts=True
-        )
+        across, up, first, cell, count = _cut_cells(place, number)
         off, bright = (one - (np.bincount(cell, one) / count)[cell] for one in (time, light))
         weight = np.bincount(cell, off * off)
         good = (count >= LEAST_OF_CELL) & (weight > 0.0)
@@ -445,6 +446,35 @@ def _find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray
             turned = np.lexsort((across[first[good]], up[first[good]]))
             alike = weigh_alike(rest) * weigh_alike(rest[turned]) / FEW_PARTS**2
             yield MEDIAN_ERROR * scatter * (alike / len(slope)) ** 0.5, middle
+
+
+def _cut_cells(place: np.ndarray, number: int) -> tuple[np.ndarray, ...]:
+    """Cells of the ground in which so many places lie in the mean: column and row of the cell of each place, the first
+    place of each cell, the cell of each place, and how many each cell has."""
+    low, high = place.min(axis=1), place.max(axis=1)
+    size = max(float(np.sqrt(np.prod(high - low) * number / place.shape[1])), 1e-3)
+    across, up = ((place - low[:, None]) // size).astype(np.int64)
+    key = across * (up.max() + 1) + up
+    return (across, up, *np.unique(key, return_index=True, return_inverse=True, return_counts=True)[1:])
+
+
+def _compare_lines(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chance: float) -> Change:
+    """By how much one of several flight lines in one file is brighter than the others, in cells that both saw."""
+    order = np.argsort(time, kind="stable")
+    line = np.empty(len(time), np.int64)
+    line[order] = np.cumsum(np.append(False, np.diff(time[order]) > BREAK))
+    *_, cell, count = _cut_cells(place, CELLS[0])
+    whole, found, lines = np.bincount(cell, light), [NO_CHANGE], int(line.max()) + 1
+    for number in range(lines if lines > 1 else 0):
+        own = line == number
+        mine, level = np.bincount(cell[own], minlength=len(count)), np.bincount(cell[own], light[own], len(count))
+        both = (mine > 0) & (mine < count)
+        if both.sum() >= LEAST_CELLS:
+            off = level[both] / mine[both] - (whole - level)[both] / (count - mine)[both]
+            doubt = float(np.hypot(MEDIAN_ERROR * robust_std(off) / len(off) ** 0.5, 2.0 * SAME_GROUND))
+            # Of many lines one is off by chance.
+            found.append(weigh_change(float(np.median(off)), doubt, chance=chance / lines)._replace(is_uneven=True))
+    return max(found, key=lambda one: one.chance * abs(one.shift))
 
 
 def weigh_alike(rest: np.ndarray) -> float:

@@ -219,6 +219,13 @@ def judge_fading(
     compared = [_compare_places(calibration, found, row) for row in calibration.channels if other]
     # One laser that fades is enough.
     seen = max((ground[1] for ground in compared if ground and ground[1]), key=lambda one: one[1:3], default=fades)
+    if fades.is_uneven:
+        growth = math.expm1(fades.error)
+        return growth, [
+            f"calibration: one of the flight lines in this file is {100 * growth:.0f} % brighter or darker than the "
+            "others, over ground that they share: another energy or gain, or wet ground? The error of the constant "
+            "grows by it; run each line alone"
+        ], []
     if seen.spread < fades.spread:
         fades, hidden = seen, "the scatter of the ground in common hides"
     if fades.chance > settings.LIKELY and fades.is_uneven:
