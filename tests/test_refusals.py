@@ -213,6 +213,7 @@ FILES = [
         ("reflectance,x,y,radius\nhalf,1,2,3\n", "target 1: not numbers"),
         ("reflectance,x,y,radius,incidence\n0.2,1,2,3,89\n", "incidence must lie in 0 to 85"),
         ("reflectance,vertices\n0.2,1 2 3\n", "target 1: not numbers"), ('{"features": 3}', "not GeoJSON"),
+        (_polygon(RING, RING), "2 rings; make every part a target, without holes"),
         (_polygon(1, 2, kind="Point"), "is a Point"), ("{", "not GeoJSON"))),
     *((f"{RUN} --calibration k.toml", 2, f"k.toml: .. {words}", {"k.toml": text}) for text, words in (
         ("x = ", "not valid TOML"), (f"{TOO_FEW}constnt = 1.0", "unknown key 'constnt'; did you mean 'constant'"),

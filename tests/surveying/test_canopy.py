@@ -16,7 +16,7 @@ from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring.learn_pulse import find_clear
 from wavebatch.surveying.measuring.misfit import cover_fits, find_parts, measure_tail
-from wavebatch.surveying.systems.known_systems import compare_pulses
+from wavebatch.surveying.systems.known_systems import compare_pulses, share_repeated
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +118,18 @@ def test_a_ringing_that_moves_between_steps_is_a_tail():
     tail = dict(measure_tail(block, system, find_clear(block, system)).tail_misfit)
     assert {place * width for place in range(10, 16)} <= tail.keys()
     assert all(8 * width < lag < 17 * width and share < 0.006 for lag, share in tail.items())
+
+
+@pytest.mark.parametrize(("part", "share"), [(0.0, 0.0), (0.3, 0.28), (1.0, 0.65)])
+def test_echoes_beside_stronger_ones_at_one_lag_and_ratio_are_counted_beyond_chance(rng, part, share):
+    """A part of the second echoes has a tenth of the height, six widths after the first; the others lie anywhere. Where
+    all are alike, nothing shows how many of them chance makes so."""
+    alike = np.arange(400) < 400 * part
+    lag = np.where(alike, 12 + 0.2 * rng.standard_normal(400), rng.uniform(6, 30, 400))
+    height = np.where(alike, 10.0, 100 * np.exp(rng.uniform(np.log(0.02), np.log(0.5), 400)))
+    columns = (np.concatenate(pair) for pair in ((np.full(400, 30.0), 30 + lag), (np.full(400, 100.0), height)))
+    echoes = EchoTable.build(np.tile(np.arange(400), 2), *columns, np.full(800, 2.0))
+    assert share_repeated(echoes, 2.0) == pytest.approx(share, abs=0.03)
 
 
 PART, NO_PART = ["part", "hidden", "weak", "at the edge"], ["canopy", "half of them", "layer", "four", "object"]
