@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying import survey_blocks
+from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.systems.known_systems import draw_pulse
+from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools.simulate import Scene, find_scene, simulate_blocks
 
 CANOPY_SAMPLES, CANOPY_BEGIN, CANOPY_SIGMA, CANOPY_NOISE = 60, 5, 2.0, 1.2
@@ -22,6 +28,18 @@ def make_scene(name: str, **recording) -> Scene:
 def make_block(scene: str | Scene, n: int, seed: int = 0) -> tuple[WaveformBlock, EchoTable]:
     """One block of n waveforms and its truth."""
     return next(simulate_blocks(scene, n, seed=seed, size=n))
+
+
+def survey_file(path: Path) -> Survey:
+    """The survey of a strip, as every command makes it."""
+    with StripReader(path) as reader, reader.scan() as scan:
+        return survey_blocks(read_sample(reader, scan))
+
+
+def half_width(system: SystemPulse) -> float:
+    """Full width of a pulse at half of its height [ns]."""
+    height = draw_pulse(system, np.arange(-40.0, 60.0, 0.01))
+    return 0.01 * np.count_nonzero(height > 0.5 * height.max())
 
 
 def grow_canopy(seed, n=8000, density=0.5, tail=0.0):

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers_scenes import half_width, survey_file
 from strangers import judge_strip
 from writer_tools import data_file, leave_out
 
@@ -14,7 +15,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.judge import find_own_width
-from wavebatch.surveying.systems.known_systems import draw_pulse, find_source
+from wavebatch.surveying.systems.known_systems import find_source
 
 NUMBER, LENGTH, NOISE = 600, 90, 1.2
 
@@ -32,13 +33,6 @@ def test_widths_at_their_limit_are_no_width_that_echoes_repeat(at_limit, expecte
 
 def _lobes(sigma, tail):
     return (1.0, 0.0, sigma), (tail, 2.5 * sigma, 1.6 * sigma)
-
-
-def _half_width(system) -> float:
-    """Full width of a pulse at half of its height [ns]."""
-    lag = np.arange(-40.0, 60.0, 0.01)
-    height = draw_pulse(system, lag)
-    return 0.01 * np.count_nonzero(height > 0.5 * height.max())
 
 
 def _widen_single_echoes(seed, sigma, tail, share):
@@ -71,7 +65,7 @@ def test_a_pulse_is_no_wider_than_the_narrowest_echoes(seed, sigma, tail, share)
     lag = np.arange(-40.0, 60.0, 0.01)
     height = sum(weight * np.exp(-0.5 * ((lag - delay) / width) ** 2) for weight, delay, width in _lobes(sigma, tail))
     true = 0.01 * np.count_nonzero(height > 0.5 * height.max())
-    assert _half_width(survey.system) == pytest.approx(true, rel=0.02)
+    assert half_width(survey.system) == pytest.approx(true, rel=0.02)
     assert find_source(survey.system) is None
     assert np.mean(choose_chain(survey).run(block, survey.system).count(NUMBER) == number) > 0.98
 
@@ -88,10 +82,9 @@ def test_a_pulse_is_no_wider_than_the_narrowest_echoes(seed, sigma, tail, share)
 def test_strangers_have_the_width_of_their_measured_pulses(strip, name, width, monkeypatch):
     """Outgoing pulses, and an impulse response. Surveys found 7.39 and 13.5 ns; the last one of LVIS 7.02."""
     leave_out(monkeypatch, name)
-    with StripReader(data_file(strip)) as reader, reader.scan() as scan:
-        survey = survey_blocks(read_sample(reader, scan))
-        assert find_source(survey.system) is None
-    assert _half_width(survey.system) == pytest.approx(width, rel=0.06)
+    survey = survey_file(data_file(strip))
+    assert find_source(survey.system) is None
+    assert half_width(survey.system) == pytest.approx(width, rel=0.06)
 
 
 @pytest.mark.slow
@@ -101,7 +94,7 @@ def test_parts_of_a_stranger_have_one_width(part, monkeypatch):
     leave_out(monkeypatch, "nasa-lvis")
     with StripReader(data_file("lvis/lvis1.las")) as reader, reader.scan() as scan:
         half = [block.rows(slice(part, None, 2)) for block in read_sample(reader, scan)]
-        assert _half_width(survey_blocks(half).system) == pytest.approx(6.68, rel=0.05)
+        assert half_width(survey_blocks(half).system) == pytest.approx(6.68, rel=0.05)
 
 
 @pytest.mark.quick_cases("1440")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_scenes import make_block, make_scene
+from helpers_scenes import half_width, make_block, make_scene, survey_file
 from strips import cut_strip
 from writer_tools import data_file, leave_out
 
@@ -24,7 +24,6 @@ from wavebatch.surveying.systems.known_systems import (
     MOST_DOUBTED_KNOWN,
     compare_pulses,
     doubt_survey,
-    draw_pulse,
     find_likeness,
     find_source,
     known_systems,
@@ -136,14 +135,9 @@ def test_any_waveforms_can_be_surveyed(rng):
         assert choose_chain(survey).steps
 
 
-def _survey_file(path):
-    with StripReader(path) as reader, reader.scan() as scan:
-        return survey_blocks(read_sample(reader, scan))
-
-
 def test_riegl_is_what_is_known_of_it(riegl):
     """R1, R3 and R4 of docs/algorithms.md 8: s_ref 1.86 ns, +4 % after-pulse at +10.5 ns; noise of a pulse 1.7 DN."""
-    survey = _survey_file(riegl)
+    survey = survey_file(riegl)
     system = survey.system
     assert len(system.components) >= 3 and system.kappa == 0
     assert system.sigma_ref == pytest.approx(1.86, abs=0.05)
@@ -164,7 +158,7 @@ def test_riegl_is_what_is_known_of_it(riegl):
 @pytest.mark.slow
 def test_leica_is_what_is_known_of_it(leica):
     """A strong skew, which the skewed pulse halves and a learned one brings near the noise."""
-    survey = _survey_file(leica)
+    survey = survey_file(leica)
     system, misfits = survey.system, survey.figures
     assert len(system.components) >= 2 and 0.2 < misfits.kappa < 0.4
     assert system.sigma_ref == pytest.approx(3.15, abs=0.1)
@@ -218,11 +212,6 @@ def test_a_few_retro_reflectors_do_not_hide_the_ground(times, number):
 TAIL = PulseModel(2.2, 0.0, ((0.06, 5.0, 4.0),))
 
 
-def _survey(path):
-    with StripReader(path) as reader, reader.scan() as scan:
-        return survey_blocks(read_sample(reader, scan))
-
-
 @pytest.mark.quick_cases("flat, after-pulse")
 @pytest.mark.parametrize(
     ("scene", "pulse", "first"),
@@ -255,10 +244,10 @@ def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path,
     """
     whole = data_file("lvis/lvis1.las")
     path = cut_strip(whole, tmp_path / "cut.las", 50)
-    assert MOST_DOUBTED_KNOWN < _survey(path).figures.echoes_in_doubt < 0.35
+    assert MOST_DOUBTED_KNOWN < survey_file(path).figures.echoes_in_doubt < 0.35
     leave_out(monkeypatch, "nasa-lvis")
-    assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
-    assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"
+    assert survey_file(path).figures.echoes_in_doubt > MOST_DOUBTED
+    assert survey_file(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"
 
 
 @pytest.mark.slow
@@ -312,14 +301,14 @@ def test_fifty_widened_echoes_make_no_odd_pulse_of_a_gaussian(seed):
 @pytest.mark.quick_cases("leica")
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
-    survey = _survey(cut_strip(request.getfixturevalue(strip), tmp_path / "cut.las", 120))
+    survey = survey_file(cut_strip(request.getfixturevalue(strip), tmp_path / "cut.las", 120))
     assert survey.figures.echoes_in_doubt < MOST_DOUBTED
 
 
 @pytest.mark.slow
 def test_a_known_pulse_keeps_its_misfit_in_a_small_strip():
     """Packets of a dense forest with eight quiet samples each."""
-    survey = _survey(data_file("neon/neon_harv_a.las"))
+    survey = survey_file(data_file("neon/neon_harv_a.las"))
     assert find_source(survey.system).name == "neon-gemini" and survey.system.misfit < 0.02
     assert survey.figures.echoes_in_doubt > MOST_DOUBTED_KNOWN
 
@@ -356,13 +345,6 @@ def _count_echoes(path, survey) -> int:
     return number
 
 
-def _half_width(system: SystemPulse) -> float:
-    """Full width of a pulse at half of its height [ns]."""
-    lag = np.arange(-40.0, 60.0, 0.01)
-    height = draw_pulse(system, lag)
-    return 0.01 * np.count_nonzero(height > 0.5 * height.max())
-
-
 def test_what_is_shipped():
     assert {name: one.sensor for name, one in KNOWN.items()} == {
         "riegl-q680i": "RIEGL LMS-Q680i", "leica-als": "Leica ALS", "geolas-q560": "GeoLas (RIEGL LMS-Q560)",
@@ -378,15 +360,15 @@ def test_what_is_shipped():
         assert find_source(replace(one.system, sigma_ref=1.01 * one.system.sigma_ref)) is None
     # The outgoing pulses of the flights that they were measured on, and the impulse response of the Gemini's receiver.
     for name, width in (("geolas-q560", 4.05), ("neon-gemini", 15.1)):
-        assert _half_width(KNOWN[name].system) == pytest.approx(width, rel=0.03)
-    assert _half_width(KNOWN["nasa-lvis"].system) == pytest.approx(6.6, rel=0.05)
+        assert half_width(KNOWN[name].system) == pytest.approx(width, rel=0.03)
+    assert half_width(KNOWN["nasa-lvis"].system) == pytest.approx(6.6, rel=0.05)
     assert FWHM_PER_SIGMA * KNOWN["riegl-q680i"].system.sigma_ref == pytest.approx(4.55, rel=0.05)
 
 
 @pytest.mark.quick_cases("*leica*")
 @pytest.mark.parametrize(("strip", "name"), [("riegl", "riegl-q680i"), ("leica", "leica-als")])
 def test_a_shipped_pulse_is_that_of_its_strip(strip, name, request):
-    system = _survey(request.getfixturevalue(strip)).system
+    system = survey_file(request.getfixturevalue(strip)).system
     likeness = find_likeness(system, 1.0)
     remedy = "the survey has changed: make the file again, as its comment says"
     assert likeness and likeness.known.name == name and likeness.difference < 0.02, remedy
@@ -396,7 +378,7 @@ def test_a_shipped_pulse_is_that_of_its_strip(strip, name, request):
 @pytest.mark.slow
 def test_pulses_that_change_from_shot_to_shot_have_at_least_their_known_misfit():
     """Outgoing pulses of LVIS miss their mean by 3 %; of that its echoes have nothing in common, and add no echo."""
-    system = _survey(data_file("lvis/lvis1.las")).system
+    system = survey_file(data_file("lvis/lvis1.las")).system
     assert find_source(system).name == "nasa-lvis" and system.misfit >= KNOWN["nasa-lvis"].system.misfit == 0.027
 
 
@@ -405,7 +387,7 @@ def test_pulses_that_change_from_shot_to_shot_have_at_least_their_known_misfit()
 def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points, error):
     """54 points are 53 packets. With a Gaussian they had 116 echoes, since each after-pulse became one."""
     path = cut_strip(riegl, tmp_path / "cut.las", points)
-    small, whole = _survey(path), _survey(riegl)
+    small, whole = survey_file(path), survey_file(riegl)
     assert _count_echoes(path, small) == pytest.approx(_count_echoes(path, whole), rel=error)
     if small.figures.isolated_echoes < 20:
         assert find_source(small.system).name == "riegl-q680i"
@@ -428,7 +410,7 @@ def test_a_small_strip_finds_the_echoes_of_the_whole(first):
 
 def test_fifty_packets_with_hardly_an_isolated_echo_are_a_guess(leica, tmp_path):
     """Five Gaussians explained the fifty packets that they were learned from: 82 % more echoes, and no word."""
-    small = _survey(cut_strip(leica, tmp_path / "cut.las", 50))
+    small = survey_file(cut_strip(leica, tmp_path / "cut.las", 50))
     assert [one.code for one in doubt_survey(small.system, small.figures, small.waveforms)] == ["pulse-guess"]
 
 
