@@ -93,7 +93,8 @@ def export_strip(
             repaired.append(
                 f"{count(scan.short, 'point')} had packets shorter than their descriptor; now descriptors fit"
             )
-        repaired += [*scan.notes, *audit_header(reader, scan), *(f"warning: {line}" for line in facts.warnings)]
+        doubts = (f"warning: {line}" for line in (*facts.warnings, *scan.mixed))
+        repaired += [*scan.notes, *audit_header(reader, scan), *doubts]
         source = {"file": facts.path.name, **take_fingerprint(facts.path, facts.packets.file)}
         account = json.dumps({"export": source, "repaired": repaired, "version": __version__}, sort_keys=True)
         waveforms = write(reader, scan, target, account, overwrite, progress)

@@ -201,12 +201,18 @@ rarely .5: these are left to the warning."""
 _SHIFTS = np.arange(1, 5) / 5
 """How far away the returns are, as a share of all of them, at whose locations a return's packet is looked at too."""
 
-_HIGHEST, _WHERE, _LOCATION, _INTENSITY, _OWN, _OTHERS, _DEPTH = range(7)
+STRETCH = 64
+"""Waveforms of the sample that are looked at together: some more than prove something."""
+
+_HIGHEST, _WHERE, _LOCATION, _INTENSITY, _OWN, _OTHERS, _DEPTH, _POINT = range(8)
 """Columns of a table of returns."""
 
 
-def is_strange(table: np.ndarray) -> bool:
-    """Return whether nothing ties returns, f8 (m, 7) of `compare_returns`, to their packets, though own ones would."""
+def is_strange(table: np.ndarray, errors: float = 4.0) -> bool:
+    """Return whether nothing ties returns, f8 (m, 8) of `compare_returns`, to their packets, though own ones would.
+
+    errors: standard errors that a gain of own packets may be off.
+    """
     # In a packet of noise the highest sample is as far above the median as the lowest one below it.
     table = table[table[:, _HIGHEST] > 2.0 * median(table[:, _DEPTH])] if len(table) else table
     if len(table) < LEAST_PACKETS:
@@ -215,11 +221,23 @@ def is_strange(table: np.ndarray) -> bool:
     if quantile(table[:, _LOCATION], 0.75) - quantile(table[:, _LOCATION], 0.25) < 1.0:
         return False
     gains, possible = table[:, _OWN] - table[:, _OTHERS], 1.0 - table[:, _OTHERS].mean()
-    error = 4.0 * gains.std() / np.sqrt(len(gains))
+    error = errors * gains.std() / np.sqrt(len(gains))
     if gains.mean() > error or gains.mean() + error > MOST_GAIN * possible:
         return False
     pairs = (_LOCATION, _WHERE), (_INTENSITY, _HIGHEST)
     return all(abs(_correlate(table[:, one], table[:, other])) < MOST_ALIKE for one, other in pairs)
+
+
+def find_strange(table: np.ndarray) -> tuple[int, int] | None:
+    """Return the first and the last point of the stretches where `is_strange` holds, of a strip where it does not.
+
+    It gives a warning, no refusal, so that two standard errors do: by them no stretch of 32 simulated strips, with
+    noises of 1 to 30, and of the real ones is strange, with or without intensities.
+    """
+    table = table[np.argsort(table[:, _POINT], kind="stable")]
+    parts = np.array_split(table, max(len(table) // STRETCH, 1))
+    points = [part[[0, -1], _POINT] for part in parts if is_strange(part, errors=2.0)]
+    return (int(points[0][0]), int(points[-1][1])) if points else None
 
 
 def _correlate(a: np.ndarray, b: np.ndarray) -> float:
@@ -242,32 +260,32 @@ def compare_returns(blocks: Iterable[tuple[WaveformBlock, np.ndarray]]) -> np.nd
 
     Returns
     -------
-    f8 (m, 7)
+    f8 (m, 8)
         A row per packet with signal: height above the median and place of its highest sample; location, in samples, and
         intensity of the return; how high the packet is there, as a share of its highest sample, and at the locations of
-        the returns of others; depth of its lowest sample below the median.
+        the returns of others; depth of its lowest sample below the median; index of the return's point.
     """
-    groups: dict[int, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+    groups: dict[int, list[tuple[np.ndarray, ...]]] = {}
     for block, strength in blocks:
         returns = block.returns
         if returns is None:
             continue
         order = np.lexsort((-strength, returns.waveform))
         strongest = order[np.unique(returns.waveform[order], return_index=True)[1]]
-        part = block.samples, returns.time[strongest] / block.spacing, strength[strongest]
+        part = block.samples, returns.time[strongest] / block.spacing, strength[strongest], returns.point[strongest]
         groups.setdefault(block.digitizer.index, []).append(part)
-    tables = [np.empty((0, 7))]
+    tables = [np.empty((0, 8))]
     for group in groups.values():
-        places = np.concatenate([place for _, place, _ in group])
+        places = np.concatenate([place for _, place, *_ in group])
         sets = [places, *(np.roll(places, int(share * len(places))) for share in _SHIFTS)]
         first = 0
-        for samples, place, strength in group:
+        for samples, place, strength, point in group:
             last = first + len(samples)
             height, level = samples.max(axis=1).astype(float), median(samples, axis=1)
             height -= level
             found = np.stack([_read_height(samples, at[first:last]) - level for at in sets]) / np.maximum(height, 1.0)
             table = [height, samples.argmax(axis=1), place, strength, found[0], found[1:].mean(axis=0)]
-            tables.append(np.column_stack([*table, level - samples.min(axis=1)])[height > 0])
+            tables.append(np.column_stack([*table, level - samples.min(axis=1), point])[height > 0])
             first = last
     return np.concatenate(tables)
 

@@ -153,9 +153,12 @@ class StripReader(Closing):
         packets of another strip. parts: of all units, in order, where other processes have passed over the points.
         """
         scan = Scanner(self.facts, self._points, self._packets, self._unit_points, self._sizes).run(parts)
-        if not scan.problems and (stranger := self._find_stranger(scan)):
+        if not scan.problems:
+            stranger, mixed = self._find_stranger(scan)
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
-            scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
+            problems = (f"{stranger}; {remedy}",) if stranger and not force else ()
+            warnings = (*scan.warnings, *mixed)
+            scan = replace(scan, stranger=stranger, problems=problems, mixed=mixed, warnings=warnings)
         if scan.problems and not tolerant:
             scan.close()
             raise InputError(f"{self.facts.path}: {scan.problems[0]}")
@@ -170,19 +173,21 @@ class StripReader(Closing):
         """Return at most so many runs of units that may be scanned one by one, by any processes."""
         return scanner.cut_scan(self.unit_count(), self._unit_points, parts, self._sizes)
 
-    def _find_stranger(self, scan: StripScan) -> str:
-        """Why the packets of the .wdp are certainly those of another strip; empty where they may be its own."""
+    def _find_stranger(self, scan: StripScan) -> tuple[str, tuple[str, ...]]:
+        """Why the packets of the .wdp are certainly those of another strip, and a line where those of some points are.
+        """
         file = self.facts.packets.file
         if not scan.with_waveform or self.facts.packets.internal or file is None:
-            return ""
+            return "", ()
         number = self.sample_size(scan, packet_check.WAVEFORMS, packet_check.SAMPLES)
         table = packet_check.compare_returns(self._sample_returns(scan, number))
-        if not packet_check.is_strange(table):
-            return ""
-        return (
-            f"{file.name} belongs to another strip: in a sample of {len(table)} packets, returns "
-            "lie on echoes no more often than by chance, and are not as strong as these"
-        )
+        chance = "lie on echoes no more often than by chance, and are not as strong as these"
+        if packet_check.is_strange(table):
+            return f"{file.name} belongs to another strip: in a sample of {len(table)} packets, returns {chance}", ()
+        if (points := packet_check.find_strange(table)) is None:
+            return "", ()
+        where = f"{file.name}: packets of points around {points[0]} to {points[1]} are not theirs"
+        return "", (f"{where}: returns {chance}; get the file again",)
 
     def _sample_returns(self, scan: StripScan, n_waveforms: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
         """Yield about `n_waveforms` waveforms, each block with the intensities of its returns."""

@@ -229,6 +229,8 @@ class StripScan(Closing):
     """How samples are stored, by descriptor index; only descriptors whose counts are not simply read as they are."""
     stranger: str = ""
     """Why the packets are certainly those of another strip; empty where they are not, or where it was not asked."""
+    mixed: tuple[str, ...] = ()
+    """Those of `warnings` about points whose packets are not theirs."""
 
     @property
     def notes(self) -> tuple[str, ...]:
