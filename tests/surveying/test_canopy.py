@@ -120,6 +120,21 @@ def test_a_ringing_that_moves_between_steps_is_a_tail():
     assert all(8 * width < lag < 17 * width and share < 0.006 for lag, share in tail.items())
 
 
+@pytest.mark.parametrize(("weak", "found"), [(0.05, True), (0.01, False)])
+def test_a_tail_under_neighbours_is_one_where_weaker_echoes_have_it_too(weak, found):
+    """All strong echoes have 5 % five widths after them, and three of four a neighbour there of as much again."""
+    rng = np.random.default_rng(5)
+    n, width, x = 6000, 2.0, np.arange(80.0)
+    height, time = np.exp(rng.uniform(np.log(12), np.log(200), n)), rng.uniform(24, 44, n)
+    share = np.where(height < 100, weak, 0.05 + (rng.random(n) < 0.75) * rng.uniform(0.04, 0.06, n))
+    parts = (height, time), (share * height, time + width * rng.uniform(4.95, 5.05, n))
+    signal = sum(one[:, None] * np.exp(-0.5 * ((x - at[:, None]) / width) ** 2) for one, at in parts)
+    block = WaveformBlock.from_samples(np.rint(12 + signal + rng.standard_normal((n, 80))).astype(np.uint16))
+    system = SystemPulse(sigma_ref=width, noise=ReceiverNoise(baseline=12.0, std=1.0))
+    tail = dict(measure_tail(block, system, find_clear(block, system)).tail_misfit)
+    assert tail.get(5 * width, 0.0) == (pytest.approx(0.06, rel=0.15) if found else 0.0)
+
+
 @pytest.mark.parametrize(("part", "share"), [(0.0, 0.0), (0.3, 0.28), (1.0, 0.65)])
 def test_echoes_beside_stronger_ones_at_one_lag_and_ratio_are_counted_beyond_chance(rng, part, share):
     """A part of the second echoes has a tenth of the height, six widths after the first; the others lie anywhere. Where
