@@ -371,12 +371,18 @@ def _find_change(block: WaveformBlock, judged: Mapping[float, Candidate]) -> Can
     By SURE one half of a strip had a change that the other, as likely, had not: its echoes were described by more.
     Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
     """
-    tried: list[Candidate] = []
     some = next(iter(judged.values()))  # of this pulse, by its changes
-    for change in CHANGES:
-        if len(tried) > 2 and tried[-1].exceeds(tried[-2]) > SURE:
-            break  # more of it loses more echoes
-        tried.append(judged.get(change) or _judge(block, some.name, some.system, change, known=some.known))
+
+    def at(change: float) -> Candidate:
+        return judged.get(change) or _judge(block, some.name, some.system, change, known=some.known)
+
+    none, near, more, most = CHANGES
+    tried = [at(near), at(more)]
+    # Less of it splits more echoes, more of it loses them: no further either way than is longer for sure.
+    if tried[0].exceeds(tried[1]) <= SURE or more > STEP_OF_CHANGES * tried[1].seen:
+        tried.insert(0, at(none))
+    if tried[-1].exceeds(tried[-2]) <= SURE:
+        tried.append(at(most))
     tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
     found = next(one for one in tried if one.exceeds(best) < HINT)
@@ -551,7 +557,7 @@ def _choose_misfit(
             found[end] = _explain_between(block, at(MISFITS[end]), changes, found, end)
     best, longer = look(middle - 2, middle + 2, middle)
     while longer[0] < SURE and min(lengths) > 0:
-        best, longer = look(min(lengths) - 4, min(lengths) - 2)
+        best, longer = look(min(lengths) - 2)
     while longer[-1] < SURE and max(lengths) + 4 < len(MISFITS):
         best, longer = look(max(lengths) + 4, max(lengths) + 2)
     if longer[0] > 1:
