@@ -14,7 +14,8 @@ you change it: stage attribute.incidence_angle must use the same limits, or pred
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -34,7 +35,7 @@ from wavebatch.kernels.geometry.planes import in_two_lines
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, find_single
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, find_single, spread_rows
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
@@ -63,6 +64,9 @@ ENOUGH_SLOPES = 1000
 
 GROUPS = 12
 """Groups of echoes by angle, through whose median widths the first line for the divergence goes."""
+
+PROBED = 256
+"""Waveforms that are asked for a known slope before any is decomposed: at least one in 34 must have one."""
 
 LEAST_DIVERGENCE_ERROR = 0.03
 """Relative error of a divergence from widths at best: rough ground widens echoes too, by a little. It holds where
@@ -135,9 +139,9 @@ def measure_slope(reader: StripReader, scan: StripScan) -> float:
     xyz = read_middle(reader, scan)
     if len(xyz) < ENOUGH_TO_LEARN:
         return 0.0
-    some, (around, radius) = xyz[:: max(len(xyz) // ENOUGH_SLOPES, 1)], _surround(xyz)
+    some, radius = xyz[:: max(len(xyz) // ENOUGH_SLOPES, 1)], choose_radius(xyz)
     (slope, _), _ = measure_normals(
-        some, np.tile([0.0, 0.0, -1.0], (len(some), 1)), around,
+        some, np.tile([0.0, 0.0, -1.0], (len(some), 1)), _surround(xyz, radius),
         radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR,
     )  # fmt: skip
     known = slope[np.isfinite(slope)]
@@ -156,10 +160,9 @@ def _list_places(reader: StripReader, unit: Unit) -> np.ndarray:
     return xyz[np.isfinite(xyz).all(axis=1)]
 
 
-def _surround(xyz: np.ndarray) -> tuple[Surroundings, float]:
-    """Points in which neighbours are looked for, and the radius for that [m]."""
-    radius = choose_radius(xyz)
-    return Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)]), radius
+def _surround(xyz: np.ndarray, radius: float) -> Surroundings:
+    """Points in which neighbours within a radius [m] are looked for."""
+    return Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
 
 
 def choose_radius(xyz: np.ndarray) -> float:
@@ -196,14 +199,17 @@ def choose_radius(xyz: np.ndarray) -> float:
         distance = np.full(len(some), 1e9)
         distance[near] = np.sqrt(square[last[near]])
         needed = quantile(distance, 0.9)
-    radius = float(np.clip(np.ceil(10.0 * needed) / 10.0, *RADII))
-    while radius < RADII[1]:
-        # Points whose neighbours lie on two scan lines, seen from above, have no angle.
+    first = float(np.clip(np.ceil(10.0 * needed) / 10.0, *RADII))
+    radii = [*np.arange(first, RADII[1], WIDER).round(1).tolist(), RADII[1]]
+
+    def is_enough(radius: float) -> bool:
+        """Whether few points have all neighbours on two scan lines, seen from above: those have no angle."""
         group, offset = around.find(some, radius)
-        if np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))) <= 0.1:
-            break
-        radius = min(round(radius + WIDER, 1), RADII[1])
-    return radius
+        return bool(np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))) <= 0.1)
+
+    # The first nearly always is; the wider ones are halved: neighbours take longest there.
+    least = 0 if len(radii) == 1 or is_enough(first) else 1
+    return radii[least and bisect_left(radii, True, 1, len(radii) - 1, key=is_enough)]
 
 
 def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_waveforms: int) -> Iterator[Slopes]:
@@ -222,12 +228,14 @@ def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_wa
     ------
     Slopes
     """
-    chosen = even_places(reader.unit_count(), SAMPLED_UNITS).tolist()
+    chosen, radius = even_places(reader.unit_count(), SAMPLED_UNITS).tolist(), 0.0
     for number in chosen:
         unit = reader.read_unit(number, scan)
         rows = np.flatnonzero(unit.packets.owned)
         rows = rows[:: max(len(rows) * len(chosen) // max(n_waveforms, 1), 1)]
-        around, radius = _surround(_list_places(reader, unit))
+        xyz = _list_places(reader, unit)
+        radius = radius or choose_radius(xyz)  # one for all, as a run has it
+        around = _surround(xyz, radius)
         for block, _ in reader.read_rows(unit, rows, 4096):
             # At the last return of each waveform.
             block = fill.fill(block)
@@ -266,6 +274,9 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
         give no angle. Without a divergence the system stays as it is.
     """
     parts: dict[int | None, list[np.ndarray]] = {}
+    samples = list(samples)
+    if system.radiometry.divergence is None and not _know_slopes(samples):
+        return GroundReference(system, 0)
     for sample in samples:
         block, index = sample.block, sample.block.digitizer.index
         if block.sensor is None or (index not in system.digitizers and block.spacing != spacing):
@@ -278,6 +289,13 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
     }
     main = found.get(None, np.empty((4, 0)))
     return GroundReference(replace(_refer(system, main), digitizers=others), main.shape[1], *_fit_divergence(*main))
+
+
+def _know_slopes(samples: Sequence[Slopes]) -> bool:
+    """Whether any of PROBED waveforms strikes a surface of known slope."""
+    total = sum(len(one.block) for one in samples)
+    rows = (spread_rows(len(one.block), PROBED * len(one.block) // max(total, 1)) for one in samples)
+    return any(np.isfinite(one.measure(own)[0]).any() for one, own in zip(samples, rows, strict=True) if len(own))
 
 
 def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
