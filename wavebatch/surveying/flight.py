@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,13 +34,16 @@ from wavebatch.surveying.look import (
     look_at,
     read_flight,
 )
-from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH
+from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH, thin_block
 from wavebatch.surveying.survey import survey_blocks
 from wavebatch.surveying.systems.figures import Kind, Look
 from wavebatch.surveying.systems.survey_result import SavedSurvey
 
 LEAST_SHARE = 64
 """Waveforms that each strip gives to the survey, however many strips there are."""
+
+ROOM = 8
+"""Samples of a survey that may be kept while strips are compared, so that none is read a second time for that."""
 
 CANDIDATES = 32
 """Strips that are tried as the one that most others agree with."""
@@ -63,6 +66,13 @@ class StripSample:
     blocks: tuple[WaveformBlock, ...]
     facts: Mapping[str, Any] = field(default_factory=dict)
     """For display: points, packets."""
+    share: int | None = None
+    """Waveforms that the survey gets, None for all; all are compared with it."""
+
+    def surveyed(self) -> Iterator[WaveformBlock]:
+        """The share of the survey, spread over the strip."""
+        share = self.share or self.waveforms
+        return (thin_block(block, -(-len(block) * share // self.waveforms)) for block in self.blocks)
 
     @property
     def waveforms(self) -> int:
@@ -161,9 +171,10 @@ def _read_sample(
     """The share of one of the strips, or why it cannot be read."""
     try:
         with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
-            share = waveforms or reader.sample_size(scan)
-            share = max(-(-share // strips), 1 if waveforms else LEAST_SHARE)
-            blocks = tuple(reader.sample_blocks(scan, share))
+            size = reader.sample_size(scan)
+            share = max(-(-(waveforms or size) // strips), 1 if waveforms else LEAST_SHARE)
+            held = 0 if waveforms or strips * min(HELD, size) > ROOM * size else min(HELD, size)
+            blocks = tuple(reader.sample_blocks(scan, max(share, held)))
             warnings = [asdict(one) for one in doubt_files(reader.facts, scan)]
             facts = {"points": scan.points, "packets": scan.packets, "warnings": warnings}
             fingerprint = take_fingerprint(path, reader.facts.packets.file)
@@ -171,7 +182,7 @@ def _read_sample(
             raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
     except InputError as error:
         return error
-    return StripSample(path, fingerprint, blocks, facts)
+    return StripSample(path, fingerprint, blocks, facts, share if share < held else None)
 
 
 def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Flight:
@@ -214,7 +225,7 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     kinds = dict(sorted(kinds.items()))
     group, seen = _find_group([sample for sample in samples if not _compare_kinds(sample.blocks, kinds)], spread)
     for _ in range(ROUNDS):
-        blocks = [block for sample in group for block in sample.blocks]
+        blocks = [block for sample in group for block in sample.surveyed()]
         survey = survey_blocks(blocks)
         survey = replace(survey, decisions=decide(survey))
         whole = look_at(blocks, survey.system)
