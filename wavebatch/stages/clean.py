@@ -46,7 +46,7 @@ SLOPES, STEEP = 0.02, 5.0
 LEAST_RISE = 0.5
 """... and standard deviation of the baseline's rise over half of a waveform [noise of a sample]."""
 
-LEAST_WAVEFORMS, MOST_WAVEFORMS, MOST_LOOKED = 50, 2048, 512
+LEAST_WAVEFORMS, MOST_WAVEFORMS, MOST_LOOKED = 50, 1024, 512
 """Waveforms from which defects are looked for, and how many are looked at; for what all have at one sample, fewer."""
 
 SHORTEST = 24
