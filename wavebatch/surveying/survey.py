@@ -25,10 +25,12 @@ from wavebatch.surveying.measuring.misfit import (
     MOST_FAINT,
     PEAK,
     cover_fits,
+    cover_repeated,
     find_parts,
     limit_faint,
     measure_beside,
     measure_tail,
+    share_repeated,
     suspect_pairs,
 )
 from wavebatch.surveying.measuring.noise_and_width import (
@@ -53,7 +55,7 @@ from wavebatch.surveying.measuring.residuals import decompose_again, decompose_s
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
-from wavebatch.surveying.systems.known_systems import guess_width, list_known, share_repeated
+from wavebatch.surveying.systems.known_systems import guess_width, list_known
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
 NARROWER = 0.85
@@ -288,8 +290,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
         if choice.best.change and suspect_pairs(echoes, system.sigma_ref):
             system = replace(system, misfit=bear(system, choice.best.change).misfit)
             echoes = decompose_sample(part, system)
+        repeated_share = share_repeated(echoes, system.sigma_ref)
+        system, echoes = cover_repeated(part, system, echoes)
         figures.width_in_doubt = choice.spread
-        figures.echoes_in_doubt = max(choice.doubt, doubt, left, share_repeated(echoes, system.sigma_ref))
+        figures.echoes_in_doubt = max(choice.doubt, doubt, left, repeated_share)
     else:
         part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)

@@ -25,10 +25,8 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
-from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.flags import list_neighbours
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import FEW, HALVED, find_strongest, fit_lone
@@ -236,12 +234,6 @@ def draw_pulse(system: SystemPulse, lag: np.ndarray) -> np.ndarray:
     return evaluate_pulse(pulse_shape(system, 1.0), lag[:, None], np.zeros(1), np.full(1, width))[0][:, 0]
 
 
-WEAKER, REACH = 0.5, 15
-"""Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
-
-SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
-"""Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
-
 MOST_SPREAD = 0.05
 """Difference of widths, among pulses that describe the waveforms as well, from which the width is a guess where no
 echoes stand alone: that of close pairs that a pulse takes for one."""
@@ -300,27 +292,3 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
             code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
             f"{remedy}",
         )  # fmt: skip
-
-
-def share_repeated(echoes: EchoTable, width: float) -> float:
-    """Twice the share of the echoes that, beyond chance, stand beside stronger ones, all at one lag and one ratio.
-
-    A pulse that few echoes show only roughly leaves such parts of it, each at its place; so does a part so far before
-    the peak that no pulse is learned there. Two layers of one distance do not scatter as one.
-    """
-    pairs = []
-    for row, other, lag in list_neighbours(echoes):
-        ratio = echoes.amplitude[row] / echoes.amplitude[other]
-        near = (ratio < WEAKER) & (np.abs(lag) < REACH * width)
-        pairs.append(np.stack([lag[near] / width, log(ratio[near])]))
-    lags, ratios = np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
-    most = 0.0
-    for centre in np.arange(-REACH, REACH, 0.5):
-        here = np.abs(lags - centre) <= 1
-        if np.count_nonzero(here) >= FEW:
-            alike = np.abs(ratios - median(ratios[here])) < SAME_RATIO
-            chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
-            most = max(most, float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
-    return 2 * most / max(len(echoes), 1)
-
-
