@@ -55,7 +55,7 @@ from wavebatch.surveying.measuring.residuals import decompose_again, decompose_s
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
-from wavebatch.surveying.systems.known_systems import guess_width, list_known
+from wavebatch.surveying.systems.known_systems import MOST_DOUBTED, guess_width, list_known
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
 NARROWER = 0.85
@@ -291,7 +291,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
             system = replace(system, misfit=bear(system, choice.best.change).misfit)
             echoes = decompose_sample(part, system)
         repeated_share = share_repeated(echoes, system.sigma_ref)
-        system, echoes = cover_repeated(part, system, echoes)
+        if repeated_share > MOST_DOUBTED:
+            system, echoes = cover_repeated(part, system, echoes)
         figures.width_in_doubt = choice.spread
         figures.echoes_in_doubt = max(choice.doubt, doubt, left, repeated_share)
     else:

@@ -112,7 +112,7 @@ SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
 """Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
 
 MOST_REPEATED = 0.05
-"""Share of the echoes that repeat beside stronger ones from which they are the pulse's: of real strips .03 at most."""
+"""Share of the echoes that may repeat beside stronger ones once a misfit covers what does: of real strips .03 do."""
 
 LEAST_MISFIT, MOST_MISFIT, STEP_OF_MISFITS = 0.0005, 0.128, 2**0.5
 """Misfits of a pulse: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it is no pulse of this
