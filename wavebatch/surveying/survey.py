@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.order import median
+from wavebatch.core.order import median, quantile
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.toml_file import list_entries
@@ -236,6 +236,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
             return _survey(block, measure_again(block, first, growth), learn=learn, guessed=True)
         main = find_isolated(block, system, clear)
         figures.isolated_echoes = len(main)
+        # What is clear is an echo also beside the strongest ones: else the pulse that is learned has it in its tail.
+        if len(clear):
+            share = MIN_SNR * system.noise.std / quantile(clear.amplitude, 0.99)
+            system = replace(system, faint_share=min(share, MOST_FAINT))
         starts = {"gaussian": system}
         if len(main) >= ENOUGH_TO_LEARN:
             starts[STACKED] = learn_pulse(block, system, clear, main, figures)
@@ -249,7 +253,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
             starts[JOINTLY] = learn_alone(block.rows(main.waveform), starts[STACKED])
         choice = choose_pulse(thin_empty(block, system), starts, list_known(block, system), plain=plain)
         # Starts of guessed widths are measured from nothing, and know no defects.
-        system, candidates = replace(choice.best.system, defects=first.defects), choice.tried
+        system = replace(choice.best.system, defects=first.defects, faint_share=MOST_FAINT)
+        candidates = choice.tried
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
         gaussians = (one.nats for one in choice.tried if one.name.startswith("gaussian"))
         figures.gaussian_nats = min(gaussians, default=None)
