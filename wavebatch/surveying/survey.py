@@ -253,7 +253,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
             starts[JOINTLY] = learn_alone(block.rows(main.waveform), starts[STACKED])
         choice = choose_pulse(thin_empty(block, system), starts, list_known(block, system), plain=plain)
         # Starts of guessed widths are measured from nothing, and know no defects.
-        system = replace(choice.best.system, defects=first.defects, faint_share=MOST_FAINT)
+        system = replace(choice.best.system, defects=first.defects)
         candidates = choice.tried
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
         gaussians = (one.nats for one in choice.tried if one.name.startswith("gaussian"))
@@ -282,7 +282,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
             system = replace(system, ringing=max((share for share in tail if share >= LEAST_RINGING), default=0.0))
         system = choose_whitening(part, system, choice.best.change, looked)
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
-        system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)
+        system = limit_faint(replace(system, faint_share=MOST_FAINT), max(choice.best.seen, LEAST_MISFIT), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_again(part, system, borne, echoes)
