@@ -32,7 +32,7 @@ from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets, name_gains
 from wavebatch.surveying.systems.known_systems import doubt_survey
-from wavebatch.surveying.systems.survey_result import format_survey
+from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 MOST_REPORT = 64 << 20
@@ -80,7 +80,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
         "options": {name: getattr(job.options, name) for name in WRITING} | {"columns": list(job.columns)},
         "request": {
             "chain": job.request.describe() or effective(job.chain),
-            "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
+            "system": None if saved is None else _hash_survey(saved),
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
             "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
@@ -89,6 +89,16 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             **({"selection": job.chosen.describe()} if job.chosen else {}),
         },
     }
+
+
+_hashed: list[tuple[SavedSurvey, str]] = []
+
+
+def _hash_survey(saved: SavedSurvey) -> str:
+    """The checksum of a survey, once for the strips that share it: that of a flight names all of them."""
+    if not (_hashed and _hashed[0][0] is saved):
+        _hashed[:] = [(saved, hashlib.sha256(format_survey(saved).encode()).hexdigest())]
+    return _hashed[0][1]
 
 
 def describe_strip_result(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:
