@@ -41,7 +41,7 @@ from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.matching import setting, strip_match
-from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_alike
+from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, refuse_headings, weigh_alike
 from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
 from wavebatch.tools.api import plan_run
 
@@ -209,6 +209,41 @@ def test_what_a_term_is_known_to_at_the_edge_is_in_the_errors(tmp_path, calibrat
 
 
 SENSOR = Sensor(**BASE, light=LIGHT)
+
+
+def test_the_term_over_the_scan_angle_is_not_known_beyond_the_edge_that_showed_it():
+    """Light that falls on, by the square, was 18 and 33 % off at 1.25 and 1.5 times that angle, with 5 % stated."""
+    swath, share = (0.2, 0.25, 0.04, 0.0), np.array([-1.5, -1.0, 0.3, 1.0, 1.25, 1.5])
+    system = SystemPulse(2.0).with_radiometry(constant=1.0, constant_error=0.05, swath=swath, right=(1.0, 0.0))
+    direction = np.stack([np.tan(0.2 * share), 0.0 * share, -np.ones(6)], axis=1)
+    rows = {"direction": direction, "digitizer": Digitizer(1, 8, 32, 1.0), "scanner": None, "__len__": lambda _: 6}
+    constant, error = system.calibrate(type("Block", (), rows)())
+    true = 1.0 / (1.0 - 0.25 * share**2)
+    np.testing.assert_allclose(error[[1, 2, 3]], 0.05, rtol=1e-6)
+    beyond = [0, 4, 5]
+    off = np.abs(constant / true - 1.0)[beyond] / error[beyond]
+    assert (off < 1.0).all() and (off > 0.5).all()
+
+
+@pytest.mark.parametrize(("turns", "straight", "right"), [
+    ((0, 0), 1.0, (1, 0)), ((0, 10), 0.996, (1, 0)), ((0, 180, 180), 1 / 3, (-1, 0)), ((0, 90), 0.707, (1, -1)),
+])  # fmt: skip
+def test_a_flight_of_several_headings_has_no_right_side(turns, straight, right):
+    """A term over the scan angle was taken along the flight: a file of two opposite lines was 20 % off, 5 % stated."""
+    place, time = [], []
+    for number, turn in enumerate(np.radians(turns)):
+        along = np.linspace(-500.0, 500.0, 400)
+        place.append(np.stack([np.sin(turn) * along + 300.0 * number, np.cos(turn) * along]))
+        time.append(600.0 * number + along / 60.0)
+    found, how = setting._find_right(np.concatenate(time), np.concatenate(place, axis=1))
+    assert how == pytest.approx(straight, abs=0.01)
+    np.testing.assert_allclose(found, np.array(right) / np.hypot(*right), atol=0.09)
+    reader = SimpleNamespace(facts=SimpleNamespace(path="a.las"))
+    flight = Setting(None, {}, {}, {}, found, NO_CHANGE, None, how)
+    if how < 0.9:
+        refuses(InputError, "several headings, so that a term over the scan angle", refuse_headings, reader, flight)
+    else:
+        refuse_headings(reader, flight)
 
 
 @pytest.mark.slow

@@ -553,5 +553,10 @@ class SystemPulse:
                 constant[same], error[same] = value, value_err
         if given.swath:
             angle = angle_across(block.direction, given.right)
-            constant *= np.exp(swath_columns(angle, given.swath[0]) @ given.swath[1:])
+            columns = swath_columns(angle, given.swath[0])
+            constant *= np.exp(columns @ given.swath[1:])
+            # Beyond the edge of the swath that showed it, the term stays or goes on: the error is the difference.
+            share = np.clip(angle / given.swath[0], -3.0, 3.0)
+            further = np.stack([share**2, share**4, share], axis=1) - columns
+            error = np.hypot(error, np.expm1(np.abs(further @ given.swath[1:])))
         return constant, error

@@ -30,7 +30,7 @@ from wavebatch.surveying.calibrating.calibration_files import Target
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, open_source
 from wavebatch.surveying.calibrating.targets import MOST_ECHOES, build_calibration, describe_channel, measure_ranging
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, check_attenuation
-from wavebatch.surveying.matching.setting import PLACES, SCANNERS, number_channel, see_channels
+from wavebatch.surveying.matching.setting import PLACES, SCANNERS, number_channel, refuse_headings, see_channels
 from wavebatch.surveying.matching.strip_energies import StripEnergies
 
 MOST_TIES = 200_000
@@ -100,6 +100,8 @@ def read_strip(
     """Decompose what lies on targets or in the overlap with other strips, in one pass."""
     with open_source(path, options) as source:
         header = source.reader.facts.header
+        if options.scan_angle:
+            refuse_headings(source.reader, source.setting)
         targets = [target.place(path, header) for target in targets]
         seen = see_channels(source.reader, source.scan)
         known = source.reader.facts.digitizers  # points may name others: they have no waveform

@@ -97,6 +97,10 @@ fewest such cells."""
 BREAK = 10.0
 """Time without a pulse from which another flight line begins [s]: aircraft turn for longer."""
 
+HEADINGS, LEAST_STRAIGHT = 4, 0.97
+"""Parts of a flight line whose middles give its heading, and least straightness of a flight that has one right side:
+headings that scatter by 14 degrees about their mean, by which scan angles of 15 degrees are half a degree wrong."""
+
 BRIGHT = 0.95
 """Quantile of the light of waveforms: above it lie few metal roofs and signs."""
 
@@ -167,6 +171,8 @@ class Setting(NamedTuple):
     """How this light grows from the first half of the strip to the second."""
     zone: Zone | None
     """None where there is no rate."""
+    straight: float = 1.0
+    """Way from the start to the end of the flight over the length of its path; of several lines, of all together."""
 
 
 def weigh_change(
@@ -300,12 +306,31 @@ def measure_setting(
         lines = _compare_lines(time, np.log(light), rows[2:4], chance=chance)
         fading += [lines] if lines.chance > LIKELY else []
     fades = max(fading, key=lambda one: one.error)
-    right = (0.0, 0.0)  # by the mean motion of the sensor; 0 where it does not move
-    if every.size:
-        time, *place = every[[0, 6, 7]] - every[[0, 6, 7]].mean(axis=1, keepdims=True)
-        ahead = np.nan_to_num(np.stack(place) @ time)
-        right = tuple((np.array([ahead[1], -ahead[0]]) / max(float(np.hypot(*ahead)), 1e-30)).tolist())
-    return Setting(rate, brightest, scenes, places, right, fades, zone)
+    right, straight = _find_right(every[0], every[6:8])
+    return Setting(rate, brightest, scenes, places, right, fades, zone, straight)
+
+
+def _find_right(time: np.ndarray, place: np.ndarray) -> tuple[tuple[float, float], float]:
+    """Unit vector to the right of the flight by positions of the sensor f8 (2, n), and `Setting.straight`; 0 where it
+    does not move."""
+    order, steps = np.argsort(time, kind="stable"), [np.zeros((1, 2))]
+    for line in np.split(place[:, order], np.flatnonzero(np.diff(time[order]) > BREAK) + 1, axis=1):
+        if line.shape[1] >= HEADINGS:
+            middles = [part.mean(axis=1) for part in np.array_split(line, HEADINGS, axis=1)]
+            steps.append(np.diff(middles, axis=0))
+    every = np.concatenate(steps)
+    east, north = every.sum(axis=0).tolist()
+    whole = max(float(np.hypot(east, north)), 1e-30)
+    return (north / whole, -east / whole), whole / max(float(np.hypot(*every.T).sum()), 1e-12)
+
+
+def refuse_headings(reader: StripReader, found: Setting) -> None:
+    """Raise InputError where a flight has no right side, from which a term over the scan angle counts."""
+    if found.straight < LEAST_STRAIGHT:
+        raise InputError(
+            f"{reader.facts.path}: was flown in several headings, so that a term over the scan angle (--scan-angle) "
+            "does not apply: cut it into its flight lines"
+        )
 
 
 def _read_rows(

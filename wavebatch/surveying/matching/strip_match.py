@@ -329,6 +329,8 @@ def match_strip(
     chance = calibration.change_chance
     setting = settings.measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0, chance=chance)
     refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
+    if calibration.swath:
+        settings.refuse_headings(reader, setting)
     notes: list[str] = []
     measured = {calibration.fingerprint.get("sha256_sampled"), *(row.sha256 for row in calibration.strips)}
     other = own_strip not in measured
