@@ -120,6 +120,14 @@ def test_report_and_provenance_say_how_the_cloud_was_made(riegl, tmp_path):
         assert made[key] == expected, key
 
 
+def test_kept_packets_have_the_place_of_each_echo(tiny_strip, tmp_path):
+    run_one(tiny_strip, tmp_path, columns="+echo_time", keep_packets=True)
+    points, _ = read_cloud(tmp_path / "tiny.laz")
+    known = points["echo_time"] != -9999
+    places = points["return_point_wave_location"][known]
+    assert known.sum() > 100 and places == pytest.approx(1000 * points["echo_time"][known], abs=1)
+
+
 def test_small_strips_are_worked_on_beside_each_other(tiny_strip, tmp_path):
     names, events = ("a.las", "b.las", "c.las"), []
     jobs = [make_job(shutil.copy(tiny_strip, tmp_path / name)) for name in names]
