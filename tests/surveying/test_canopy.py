@@ -147,6 +147,20 @@ def test_echoes_beside_stronger_ones_at_one_lag_and_ratio_are_counted_beyond_cha
     assert share_repeated(echoes, 2.0) == pytest.approx(share, abs=0.03)
 
 
+@pytest.mark.parametrize(("lag", "scatter", "share"), [(7, 0.2, 0.5), (90, 0.2, 0.5), (7, 1.5, 0.0), (None, 0.0, 0.0)])
+def test_echoes_at_one_lag_are_counted_whatever_their_ratio(rng, lag, scatter, share):
+    """Second pulses whose height changes from shot to shot, and those a hundred widths later, made 20 to 39 % of the
+    echoes false, without a word. A layer below all echoes scatters by more than a part of a pulse."""
+    n = 400
+    after = rng.exponential(8, n) + 1 if lag is None else lag + scatter * rng.standard_normal(n)
+    time = np.r_[np.full(n, 30.0), 30 + 2 * after]
+    height = 100 * np.r_[np.ones(n), np.exp(rng.uniform(np.log(0.01), np.log(0.24), n))]
+    echoes = EchoTable.build(np.tile(np.arange(n), 2), time, height, np.full(2 * n, 2.0))
+    order = np.lexsort((echoes.time, echoes.waveform))
+    assert share_repeated(echoes.take(order), 2.0) == pytest.approx(share, abs=0.07)
+    assert not share_repeated(echoes.take(order[:30]), 2.0)
+
+
 PART, NO_PART = ["part", "hidden", "weak", "at the edge"], ["canopy", "half of them", "layer", "four", "object"]
 
 

@@ -108,6 +108,10 @@ beyond which some are none: in simulated scenes .15 at most, with pulses whose s
 WEAKER, REACH = 0.5, 15
 """Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
 
+NEAREST, ASIDE = 4.5, (-3.0, -1.5, 1.5, 3.0)
+"""Distance from which echoes of one lag, half as high as WEAKER at most, are counted, and lags beside it where others
+are as often [system widths]. Nearer ones merge, so that the lags where they do not seem frequent."""
+
 SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
 """Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
 
@@ -243,15 +247,18 @@ def cover_repeated(
 
 
 def share_repeated(echoes: EchoTable, width: float) -> float:
-    """Twice the share of the echoes that, beyond chance, stand beside stronger ones, all at one lag and one ratio.
+    """Twice the share of the echoes that, beyond chance, stand beside stronger ones, all at one lag and one ratio; or
+    the share that does at one lag, whatever the ratio, where that is more.
 
     A pulse that few echoes show only roughly leaves such parts of it, each at its place; so does a part so far before
-    the peak that no pulse is learned there. Two layers of one distance do not scatter as one.
+    the peak that no pulse is learned there. Two layers of one distance do not scatter as one. A part that changes from
+    shot to shot has one lag, within a fraction of a width; layers of a scene have others beside it too.
     """
-    pairs = []
+    pairs, weak = [], [np.empty(0)]
     for row, other, lag in list_neighbours(echoes):
         ratio = echoes.amplitude[row] / echoes.amplitude[other]
         near = (ratio < WEAKER) & (np.abs(lag) < REACH * width)
+        weak.append(lag[ratio < WEAKER / 2] / width)
         pairs.append(np.stack([lag[near] / width, log(ratio[near])]))
     lags, ratios = np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
     most = 0.0
@@ -260,8 +267,15 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
         if np.count_nonzero(here) >= FEW:
             alike = np.abs(ratios - median(ratios[here])) < SAME_RATIO
             chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
-            most = max(most, float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
-    return 2 * most / max(len(echoes), 1)
+            most = max(most, 2 * float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
+    lag = np.sort(np.concatenate(weak))
+    centre = np.arange(-NEAREST, NEAREST, 0.25) if not len(lag) else np.arange(lag[0] - 1, lag[-1] + 1, 0.25)
+    place = centre[np.abs(centre) > NEAREST, None] + np.array([0.0, *ASIDE])
+    number = np.searchsorted(lag, place + 0.5) - np.searchsorted(lag, place - 0.5)
+    beside = np.max(number[:, 1:], axis=1)
+    more = number[:, 0] - beside
+    more = more[(more >= FEW) & (more > SURE * np.sqrt(number[:, 0] + beside))]
+    return max(most, float(more.max(initial=0))) / max(len(echoes), 1)
 
 
 def _list_distances(echoes: EchoTable, width: float) -> tuple[np.ndarray, np.ndarray]:
