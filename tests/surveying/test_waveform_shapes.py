@@ -247,6 +247,18 @@ def test_some_hundred_photons_of_an_echo_are_noise(width, growth):
     assert found > 0.97 and true > 0.99
 
 
+def test_photons_in_coloured_noise_are_noise():
+    """An amplifier that colours its own noise colours that of the photons: half of the echoes were false."""
+    signal, rows, time, _ = render(bell, 42, n=800, s=128, amplitude=(20, 400), width=2.1, second=0.3)
+    drawn = np.random.default_rng(42).standard_normal((2, *signal.shape))
+    drawn *= np.sqrt([np.full(signal.shape, 4), 8 * signal])
+    for at in range(1, 128):
+        drawn[:, :, at] = 0.6 * drawn[:, :, at - 1] + 0.8 * drawn[:, :, at]
+    samples = np.rint(60 + signal + drawn.sum(axis=0)).clip(0).astype(np.uint16)
+    system, found, true = scores(WaveformBlock.from_samples(samples), rows, time)
+    assert system.noise.gain > 1 and found > 0.95 and true > 0.95
+
+
 def test_close_pairs_are_no_noise_of_photons():
     """Gaussians miss pairs, and pulses with a tail, by what grows with the signal as the noise of photons does."""
     rng = np.random.default_rng(43)

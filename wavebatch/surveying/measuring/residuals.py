@@ -58,6 +58,9 @@ MANIFOLD = 20.0
 """Variance that strong echoes add, over that of noise without signal, from which fits by white noise split nearly all
 of them, so that those that stay single do not show it."""
 
+LEAST_FINE = 0.2
+"""Share of the noise's variance in eighth differences, at least, from which photons are known by these."""
+
 ENOUGH_TO_GROW, ENOUGH_FINE, MOST_FINE = 2000, 500, 1024
 """Samples in which a growth is looked for, and in which one of MANIFOLD shows; and echoes that are asked for it."""
 
@@ -212,10 +215,13 @@ def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     """The growth of the noise per count of signal before a pulse is known, from Gaussians fitted to lone echoes (m,).
 
     0 where it is less than MANIFOLD: then fits of the pulse show it. Pulses, close pairs and what Gaussians miss of
-    them are smooth, photons are not: in eighth differences only noise is left, if it is not coloured (H12).
+    them are smooth, photons are not: eighth differences leave only noise, coloured as without signal (H12).
     """
     noise = system.noise
-    if len(echoes) < FEW or system.sigma_ref < block.spacing or noise.std > COLOURED * noise.quiet:
+    taps = np.r_[FINE[:0:-1], FINE]
+    apart = np.abs(np.subtract.outer(np.arange(len(taps)), np.arange(len(taps))))
+    left = float(taps @ np.r_[1.0, noise.correlation, np.zeros(len(taps))][apart] @ taps)  # of such noise's variance
+    if len(echoes) < FEW or system.sigma_ref < block.spacing or left < LEAST_FINE or noise.quiet < UNDITHERED:
         return 0.0
     echoes = echoes.take(spread_rows(len(echoes), MOST_FINE))
     part, rows = block.rows(echoes.waveform), np.arange(len(echoes), dtype=np.int32)
@@ -224,8 +230,9 @@ def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     fine, signal = (filter_symmetric(one.T, taps).T for one, taps in ((residual, FINE), (model, FINE**2)))
     lag = (np.arange(model.shape[1]) - echoes.time[:, None] / block.spacing) / (echoes.sigma[:, None] / block.spacing)
     # Of an endless width: the fit takes away nothing of such differences.
-    gain = _noise_gain(fine, signal, lag, np.full(len(rows), np.inf), noise.quiet, False, steep=True)
-    return gain if gain * quantile(echoes.amplitude, 0.9) > MANIFOLD * noise.quiet**2 else 0.0
+    std = noise.quiet * np.sqrt(left)
+    gain = _noise_gain(fine, signal, lag, np.full(len(rows), np.inf), std, False, steep=True) * (noise.std / std) ** 2
+    return gain if gain * quantile(echoes.amplitude, 0.9) > MANIFOLD * noise.std**2 else 0.0
 
 
 def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
