@@ -17,6 +17,7 @@ from commands import refuses, run_command
 
 import wavebatch as wb
 from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.errors import StageError
 from wavebatch.stages.chain import list_profiles
 from wavebatch.surveying.systems.figures import describe_figures
 from wavebatch.tools.simulate import simulate_strip
@@ -205,6 +206,12 @@ def test_waveforms_of_arrays_are_surveyed_and_decomposed(rng):
     assert np.array_equal(wb.auto_chain(survey).run(swapped, survey.system).time, echoes.time)
     assert np.abs(echoes.time - centre).max() < 0.5
     refuses(wb.ConfigError, "needs the points of a strip", wb.survey, [block], divergence=0.5)
+    for option, values in {"waveforms": (0, -1, "10", 1.5), "divergence": (-1, 0, np.nan, "0.5")}.items():
+        for value in values:
+            refuses(wb.ConfigError, f"{option}: must .* got {value!r}", wb.survey, block, **{option: value})
+    for bits in (0, 99, "8"):
+        refuses(StageError, "bits must be a whole number from 1 to 32", wb.WaveformBlock.from_samples, block.samples,
+                bits=bits)  # fmt: skip
     for nothing in ([], [block.rows(slice(0))]):
         refuses(wb.InputError, "hold no waveform", wb.survey, nothing)
     for other in (block.samples, [block.samples], None):

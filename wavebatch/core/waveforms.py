@@ -300,7 +300,7 @@ class WaveformBlock:
         Raises
         ------
         StageError
-            The samples are not unsigned integers, not two-dimensional, or masked; the spacing is not positive.
+            The samples are not unsigned integers, not two-dimensional, or masked; spacing or bits cannot be.
         """
         if isinstance(getattr(samples, "mask", None), np.ndarray | np.bool_):  # a table of pandas has a method `mask`
             raise StageError("samples are a masked array, and its mask would be ignored; give a plain array")
@@ -311,6 +311,8 @@ class WaveformBlock:
                              "and round them, e.g. np.rint(samples).astype(np.uint16)")  # fmt: skip
         if not (isinstance(spacing, int | float | np.number) and 0 < spacing < np.inf):
             raise StageError(f"spacing must be above 0 ns, got {spacing!r}")
+        if not (bits is None or isinstance(bits, int | np.integer) and 1 <= bits <= 32):
+            raise StageError(f"bits must be a whole number from 1 to 32, got {bits!r}")
         n, s = samples.shape
         samples = samples.astype(samples.dtype.newbyteorder("="), copy=False).view()
         samples.flags.writeable = False

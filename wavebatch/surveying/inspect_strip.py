@@ -378,8 +378,12 @@ def survey(
     InputError
         Where the strip cannot be read or holds no waveform.
     ConfigError
-        Where it is neither a strip nor waveforms, or an option needs points that it does not have.
+        Where it is neither a strip nor waveforms, or an option cannot be, or needs points that it does not have.
     """
+    if not (waveforms is None or isinstance(waveforms, int | np.integer) and waveforms >= 1):
+        raise ConfigError(f"waveforms: must be a whole number from 1 on, got {waveforms!r}")
+    if not (divergence is None or isinstance(divergence, int | float | np.number) and 0.001 <= divergence <= 100):
+        raise ConfigError(f"divergence: must lie from 0.001 to 100 mrad, got {divergence!r}")
     from wavebatch.surveying.choose_chain import read_sample  # `info` needs none of these
     from wavebatch.surveying.flat_ground import survey_angles
     from wavebatch.surveying.look import with_look
