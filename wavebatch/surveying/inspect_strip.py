@@ -40,9 +40,10 @@ _MATCHED = 1024
 LARGEST_TIME = 1e10
 """No GPS time is later [s]: three centuries."""
 
-LEAST_RETURNS, LEAST_MATCHED = 20, 0.5
+LEAST_RETURNS, LEAST_MATCHED, MOST_FOREIGN = 20, 0.7, 0.5
 """Returns in waveforms with echoes, and share of them that an echo should match: below it the packets are doubted. Own
-packets match .85 to 1.00 of them (real and simulated strips), those of another strip .1 to .4.
+packets match .92 to 1.00 of them (real strips), or .74 where a tenth of the simulated ones is weaker than the noise;
+those of another strip .1 to .4, so that with the last share or more some of the packets are the strip's.
 """
 
 
@@ -203,8 +204,8 @@ def doubt_files(facts: StripFacts, scan: StripScan) -> Iterator[StripWarning]:
 def doubt_packets(facts: StripFacts, matched: int, returns: int) -> Iterator[str]:
     """Say that packets do not belong to the points, if too few returns in waveforms with echoes match an echo."""
     if returns >= LEAST_RETURNS and matched < LEAST_MATCHED * returns:
-        packets = facts.packets
-        other = "" if packets.file is None or packets.internal else f"{packets.file.name} belongs to another strip, or "
+        file, own = facts.packets.file, facts.packets.internal or matched >= MOST_FOREIGN * returns
+        other = "" if file is None or own else f"{file.name} belongs to another strip, or "
         yield (
             f"only {matched} of {returns} returns lie where their packet has an echo: {other}the return locations "
             "(which should be picoseconds after the first sample) are wrong, and so are the positions of added echoes; "
