@@ -18,6 +18,7 @@ from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
 from wavebatch.surveying.measuring.choose_pulse import JOINTLY, STACKED, bear, choose_pulse, learn_alone, settle
+from wavebatch.surveying.measuring.joint_pulse import LEAST_CHANGE
 from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse, measure_skew
 from wavebatch.surveying.measuring.misfit import (
@@ -239,7 +240,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
         # What is clear is an echo also beside the strongest ones: else the pulse that is learned has it in its tail.
         if len(clear):
             share = MIN_SNR * system.noise.std / quantile(clear.amplitude, 0.99)
-            system = replace(system, faint_share=min(share, MOST_FAINT))
+            system = replace(system, faint_share=min(max(share, LEAST_CHANGE), MOST_FAINT))
         starts = {"gaussian": system}
         if len(main) >= ENOUGH_TO_LEARN:
             starts[STACKED] = learn_pulse(block, system, clear, main, figures)
@@ -253,7 +254,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
             starts[JOINTLY] = learn_alone(block.rows(main.waveform), starts[STACKED])
         choice = choose_pulse(thin_empty(block, system), starts, list_known(block, system), plain=plain)
         # Starts of guessed widths are measured from nothing, and know no defects.
-        system = replace(choice.best.system, defects=first.defects)
+        system = replace(choice.best.system, defects=first.defects, faint_share=MOST_FAINT)
         candidates = choice.tried
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
         gaussians = (one.nats for one in choice.tried if one.name.startswith("gaussian"))
@@ -282,7 +283,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
             system = replace(system, ringing=max((share for share in tail if share >= LEAST_RINGING), default=0.0))
         system = choose_whitening(part, system, choice.best.change, looked)
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
-        system = limit_faint(replace(system, faint_share=MOST_FAINT), max(choice.best.seen, LEAST_MISFIT), echoes)
+        system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_again(part, system, borne, echoes)
