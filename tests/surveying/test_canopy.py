@@ -241,11 +241,11 @@ def test_a_pulse_that_changes_is_seen_where_neighbours_are_rare(number, tmp_path
 
 
 @pytest.mark.quick_cases("4376")
-@pytest.mark.parametrize("number", [4376, 2576])
+@pytest.mark.parametrize("number", [4376, 3799])
 def test_clear_echoes_do_not_become_the_tail_of_stronger_ones(number, tmp_path):
-    """Of 3,000 to 20,000 noises 2 % are clear: 4 to 6 % of such echoes were missed behind others."""
+    """Of 3,000 noises 2 % are clear: 4 % of such echoes were missed behind others."""
     result = judge_strip(number, tmp_path)
-    assert result["right"] and result["missed"] < 0.03 and result["extra"] < 0.01
+    assert result["right"] and result["missed"] < 0.02 and result["extra"] < 0.02
 
 
 @pytest.mark.quick_cases("4204")
