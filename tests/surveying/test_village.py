@@ -158,6 +158,19 @@ def test_level_ground_is_told_from_the_swath(half_angle):
     assert seen.widths.scatter < 0.01 * true
 
 
+def test_slopes_are_seen_in_samples_of_a_few_waveforms():
+    """Without a divergence some waveforms of each tell whether any slope is known."""
+    known, surveyed = see_swath(25.0)
+    parts = [
+        Slopes(known.block.rows(slice(row, row + 2)), lambda own, row=row: known.measure(row + own))
+        for row in range(0, 1000, 2)
+    ]
+    pulse = surveyed.with_radiometry(divergence=None)
+    whole = measure_reference([Slopes(known.block.rows(slice(0, 1000)), known.measure)], pulse, known.block.spacing)
+    found = measure_reference(parts, pulse, known.block.spacing)
+    assert whole.echoes > 0 and found.echoes == whole.echoes
+
+
 def test_a_digitizer_has_the_beam_of_its_strip_and_its_error():
     known, pulse = see_swath(10.0)
     doubtful = pulse.with_radiometry(divergence_error=0.2)

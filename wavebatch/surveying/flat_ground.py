@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -275,8 +275,12 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
     """
     parts: dict[int | None, list[np.ndarray]] = {}
     samples = list(samples)
-    if system.radiometry.divergence is None and not _know_slopes(samples):
-        return GroundReference(system, 0)
+    if system.radiometry.divergence is None:
+        # Without any known slope, nothing is decomposed: some waveforms of each sample tell.
+        share = max(sum(len(one.block) for one in samples) / PROBED, 1.0)
+        rows = (spread_rows(len(one.block), math.ceil(len(one.block) / share)) for one in samples)
+        if not any(np.isfinite(one.measure(own)[0]).any() for one, own in zip(samples, rows, strict=True) if len(own)):
+            return GroundReference(system, 0)
     for sample in samples:
         block, index = sample.block, sample.block.digitizer.index
         if block.sensor is None or (index not in system.digitizers and block.spacing != spacing):
@@ -289,13 +293,6 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
     }
     main = found.get(None, np.empty((4, 0)))
     return GroundReference(replace(_refer(system, main), digitizers=others), main.shape[1], *_fit_divergence(*main))
-
-
-def _know_slopes(samples: Sequence[Slopes]) -> bool:
-    """Whether any of PROBED waveforms strikes a surface of known slope."""
-    total = sum(len(one.block) for one in samples)
-    rows = (spread_rows(len(one.block), PROBED * len(one.block) // max(total, 1)) for one in samples)
-    return any(np.isfinite(one.measure(own)[0]).any() for one, own in zip(samples, rows, strict=True) if len(own))
 
 
 def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:

@@ -162,7 +162,7 @@ class Spool(Closing):
         """Add entries (k,) to buckets (k,)."""
         if not len(entries):
             return
-        self._pending.append((bucket.astype(np.int64), entries.astype(self.dtype, copy=False)))
+        self._pending.append((bucket.astype(np.int64), entries.astype(self.dtype, casting="same_kind", copy=False)))
         self._held += entries.nbytes + 8 * len(bucket)
         self.count += len(entries)
         if self._held >= self._most:
