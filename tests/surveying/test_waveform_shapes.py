@@ -346,44 +346,8 @@ def test_jumps_at_the_start_are_no_echoes(everywhere):
     signal[:, 0] += jump
     signal[:, 1] += 0.4 * jump
     system, found, true = scores(digitize(signal, 7), rows, time)
-    if everywhere:  # what all waveforms have is taken off, and no sample is lost
-        assert system.defects.pattern[0] == pytest.approx(8, abs=0.2) and not system.defects.transient
-    else:
-        assert 2 <= system.defects.transient <= 3
+    assert 2 <= system.defects.transient <= 3
     assert found > 0.99 and true > 0.993
-
-
-@pytest.mark.parametrize("height", [9.0, -9.0, 0.6])
-def test_what_the_start_pulse_leaves_in_all_waveforms_is_no_echo(height):
-    """A leak of 5 noises at one place made 40 % of the echoes false, without a word; faint ones add to no echo."""
-    signal, rows, time, _ = render(bell, 9, s=120, place=(0.3, 0.8), amplitude=(10, 100))
-    leak = height * bell((np.arange(120) - 15.3) / 2)
-    system, found, true = scores(digitize(signal + leak, 9, base=40), rows, time)
-    pattern = np.array(system.defects.pattern)
-    if abs(height) < 1:
-        assert not len(pattern)
-    else:
-        assert len(pattern) == 120 and pattern[:26] == pytest.approx(leak[:26], abs=0.6) and not pattern[30:].any()
-    assert found > 0.99 and true > 0.993
-    # A block with more samples than the survey saw has nothing there; one with fewer has its own part.
-    if len(pattern):
-        for s in (150, 60):
-            block = digitize(np.zeros((3, s)), 9)
-            taken = block.samples - clean_block(block, system).samples
-            assert taken == pytest.approx(np.pad(pattern, (0, 40))[:s] * np.ones((3, 1)), abs=1e-4)
-
-
-@pytest.mark.parametrize("scene", ["weak", "layered", "alone"])
-def test_targets_at_one_place_of_all_waveforms_are_no_defect(rng, scene):
-    """Packets begin at a trigger, before the first echo; and a scanner may look at one target all the time."""
-    x, n = np.arange(120), 800
-    heights = {"weak": 7 + rng.exponential(3, n), "layered": 50 * (1 + 0.05 * rng.standard_normal(n)), "alone": 50.0}
-    at = 30 + (scene != "alone") * rng.uniform(-0.5, 0.5, (n, 1))
-    signal = np.reshape(heights[scene] * np.ones(n), (n, 1)) * bell((x - at) / 2)
-    if scene != "alone":
-        signal += rng.uniform(0, 60, (n, 1)) * bell((x - rng.uniform(50, 110, (n, 1))) / 2)
-    block = digitize(signal, 3, base=20)
-    assert not measure_defects(block, measure_gaussian(block)).defects.pattern
 
 
 def test_sloping_baselines_hide_no_echo():

@@ -14,15 +14,7 @@ import numpy as np
 
 from wavebatch.core.order import median, quantiles
 from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
-from wavebatch.kernels.signal.defects import (
-    PERIOD,
-    fill_spikes,
-    find_fixed,
-    find_pattern,
-    find_spikes,
-    find_transient,
-    fit_slopes,
-)
+from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, transpose_samples
 from wavebatch.stages.pulse_tables import clip_level, floor_level
@@ -46,8 +38,8 @@ SLOPES, STEEP = 0.02, 5.0
 LEAST_RISE = 0.5
 """... and standard deviation of the baseline's rise over half of a waveform [noise of a sample]."""
 
-LEAST_WAVEFORMS, MOST_WAVEFORMS, MOST_LOOKED = 50, 1024, 512
-"""Waveforms from which defects are looked for, and how many are looked at; for what all have at one sample, fewer."""
+LEAST_WAVEFORMS, MOST_WAVEFORMS = 50, 1024
+"""Waveforms from which defects are looked for, and how many are looked at."""
 
 SHORTEST = 24
 """Samples of a waveform from which defects are looked for."""
@@ -83,9 +75,7 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
     signal = raw.copy()
     if defects.pattern:
         offsets = np.array(defects.pattern, np.float32)
-        repeats = len(offsets) <= PERIOD or len(offsets) >= len(signal)
-        offsets = np.resize(offsets, len(signal)) if repeats else np.pad(offsets, (0, len(signal) - len(offsets)))
-        signal -= offsets[:, None]
+        signal -= offsets[np.arange(len(signal)) % len(offsets)][:, None]
     missing = None if block.missing is None else block.missing.T
     if defects.slope_spread > 0:
         # The sloping part of each baseline, 0 in its middle: own slopes, drawn towards none by their errors.
@@ -169,19 +159,12 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     above = signal - level
     if missing is not None:
         above[missing] = 0
-    few = slice(None, None, max(len(block) // MOST_LOOKED, 1))
-    unknown = np.float32(0) if missing is None else np.where(missing, np.float32(np.nan), np.float32(0))[:, few]
-    fixed = find_fixed(above[:, few] + unknown, std).astype(np.float32)
-    above, signal = above - fixed[:, None], signal - fixed[:, None]
     quiet = find_quiet(above, np.float32(3.5 * np.hypot(SMOOTH_GAIN * std, system.noise.baseline_spread) + 0.25), reach)
     if missing is not None:
         quiet &= ~missing
     offsets, error = find_pattern(signal, quiet)
-    if np.abs(offsets).max() <= max(PATTERN * max(std, 1.0), CERTAIN * error.max()):
-        offsets = np.zeros(0)
-    if fixed.any():
-        offsets = fixed + np.resize(offsets, len(fixed)) if len(offsets) else fixed
-    defects = replace(defects, pattern=tuple(offsets.tolist()))
+    if np.abs(offsets).max() > max(PATTERN * max(std, 1.0), CERTAIN * error.max()):
+        defects = replace(defects, pattern=tuple(offsets.tolist()))
     if width >= NARROWEST:
         spikes = np.count_nonzero(find_spikes(above, std, width)) / len(block)
         defects = replace(defects, spikes=spikes if spikes > LEAST_SPIKES else 0.0)

@@ -12,7 +12,7 @@ from wavebatch.core.order import median, quantile
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.toml_file import list_entries
-from wavebatch.kernels.signal.defects import PERIOD, find_seam
+from wavebatch.kernels.signal.defects import find_seam
 from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.pulse_tables import clip_level
@@ -382,11 +382,7 @@ def _decide(
 
 def _decide_defects(defects: Defects) -> Iterator[Decision]:
     """What is taken off the waveforms before anything else, of those that have it."""
-    if len(defects.pattern) > PERIOD:
-        highest = max(defects.pattern, key=abs)
-        place = f"{highest:+.1f} DN at sample {defects.pattern.index(highest)}"
-        yield Decision("start pulse taken off", True, f"all waveforms have the same at the same place, up to {place}")
-    elif defects.pattern:
+    if defects.pattern:
         offsets = ", ".join(f"{offset:+.2f}" for offset in defects.pattern)
         yield Decision("pattern taken off", True, f"samples differ in turn by {offsets} DN: several converters")
     if defects.slope_spread:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from wavebatch.core.order import median, quantiles
-from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet
 
@@ -26,11 +25,6 @@ PERIOD = 4
 
 SEGMENTS = 6
 """Parts of a waveform whose lower quartiles give its first slope."""
-
-LOWEST, SAME, LEAST_FIXED, SEEN_ELSEWHERE = 0.0228, 1.5, 1.5, 0.1
-"""Share of normal values more than two standard deviations below their mean; scatter over that of noise up to which a
-sample is the same in all waveforms: 1.5 where two in five of them have an echo there; least height of what they share,
-in noises of a sample: from it on noise makes echoes there; and share of the waveforms with other signal."""
 
 LOOK = 8
 """Samples at the start in which transients are looked for; as many after them show what is usual."""
@@ -108,32 +102,6 @@ def find_pattern(signal: np.ndarray, quiet: np.ndarray) -> tuple[np.ndarray, np.
         if len(values) > 1:
             mean[phase], error[phase] = np.mean(values, dtype=np.float64), np.std(values) / np.sqrt(len(values))
     return mean - mean.mean(), error
-
-
-def find_fixed(above: np.ndarray, std: float) -> np.ndarray:
-    """What the receiver itself adds at each sample of every waveform, as its start pulse leaks, (s,); 0 for nothing.
-
-    Targets only add, and differ: what is there in all waveforms, and scatters like noise, is none. Unless nothing else
-    is in the strip: a scanner may look at one target all the time.
-
-    above: waveforms above their baseline, float32 (s, n); NaN where nothing was recorded: such samples are left out.
-    """
-    fixed = np.zeros(len(above))
-    known = np.isfinite(above).all(axis=1)
-    above = above[known]
-    low, middle = quantiles(above, (LOWEST, 0.5))
-    std = min(std, max(0.5 * float(median(middle - low)), QUANTISATION_STD))
-    mean = np.minimum(middle, low + 2 * std)
-    near = np.abs(above - mean[:, None]) < 2 * std + 0.5  # quantiles are whole counts
-    mean = np.sum(above, axis=1, where=near, dtype=np.float64) / np.maximum(near.sum(axis=1), 1)
-    mean -= median(mean)
-    raised = np.abs(mean) > LEAST_FIXED * std + 1
-    if not raised.any() or (middle - low)[raised].max() > 2 * SAME * std + 0.5:
-        return fixed
-    elsewhere = (above - mean[:, None] > np.float32(HEIGHT * std)).any(axis=0)
-    if np.mean(elsewhere) > SEEN_ELSEWHERE:
-        fixed[known] = np.where(np.abs(mean) < OFF * std + 0.5, 0.0, mean)
-    return fixed
 
 
 def find_transient(above: np.ndarray, std: float) -> int:

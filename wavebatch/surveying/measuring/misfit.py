@@ -115,8 +115,9 @@ are as often [system widths]. Nearer ones merge, so that the lags where they do 
 SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
 """Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
 
-MOST_REPEATED = 0.05
-"""Share of the echoes that may repeat beside stronger ones once a misfit covers what does: of real strips .03 do."""
+MOST_REPEATED, MOST_LACKED = 0.05, 0.016
+"""Share of the echoes that may repeat beside stronger ones once a misfit covers what does: of real strips .03 do. And
+the largest misfit that does: more is a second target, as rows of crops have, and no error of six Gaussians."""
 
 LEAST_MISFIT, MOST_MISFIT, STEP_OF_MISFITS = 0.0005, 0.128, 2**0.5
 """Misfits of a pulse: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it is no pulse of this
@@ -239,9 +240,9 @@ def cover_repeated(
     """
     higher, found = system, echoes
     while share_repeated(found, system.sigma_ref) > MOST_REPEATED:
-        if higher.misfit >= MOST_MISFIT:
+        if higher.misfit >= MOST_LACKED:
             return system, echoes
-        higher = replace(higher, misfit=max(STEP_OF_MISFITS**2 * higher.misfit, LEAST_MISFIT))
+        higher = replace(higher, misfit=min(max(STEP_OF_MISFITS**2 * higher.misfit, LEAST_MISFIT), MOST_LACKED))
         found = decompose_sample(block, higher)
     return higher, found
 
