@@ -5,10 +5,20 @@ import numpy as np
 from scipy.optimize import brentq
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.kernels.fit.decompose import AS_FITTED, STRETCHED
+from wavebatch.kernels.fit.decompose import AS_FITTED, STRETCHED, _as_problem
 from wavebatch.kernels.fit.learn_pulse import fit_bounded
+from wavebatch.kernels.library import call
 
 GAIN_121 = np.sqrt(6.0) / 4.0
+
+
+def promise_echoes(samples, echoes, clusters, settings):
+    """What the kernel says: fall of chi2 that one more echo promises beside those of each cluster, which are the fit.
+
+    Runs do not ask; it shows what `propose` of the kernel finds."""
+    promise = np.zeros(len(clusters.number))
+    call("promise_echoes", *_as_problem(samples, echoes, clusters, settings), promise)
+    return promise
 
 
 def whiten(n, clipped, near, far):

@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from naive_fit import promise_echoes
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.kernels import library
@@ -31,7 +32,6 @@ from wavebatch.kernels.fit.decompose import (
     cluster_candidates,
     decompose_clusters,
     explain_tails,
-    promise_echoes,
 )
 from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable, PulseTail

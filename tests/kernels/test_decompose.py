@@ -6,7 +6,7 @@ import pytest
 from commands import refuses
 from fits import decompose, settings
 
-from wavebatch.kernels.fit.decompose import Candidates, Clusters, Samples, decompose_clusters, promise_echoes
+from wavebatch.kernels.fit.decompose import Candidates, Clusters, Samples, decompose_clusters
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, PulseTable
 from wavebatch.kernels.signal.noise import whitening_filter
 
@@ -294,7 +294,7 @@ def test_the_promise_of_one_more_echo_is_that_of_the_twin(whitening, level_err):
     samples = Samples(y.astype(np.float32), np.zeros(m, np.float32), np.ones(m, np.float32))
     samples = samples._replace(level_err=None if level_err is None else np.full(m, level_err, np.float32))
     clusters = Clusters(rows, 0 * one, LENGTH * one, rows, one)
-    promised = promise_echoes(samples, Candidates(rows, p[:, 1], p[:, 0], p[:, 2]), clusters, options)
+    promised = naive_fit.promise_echoes(samples, Candidates(rows, p[:, 1], p[:, 0], p[:, 2]), clusters, options)
     clipped = np.zeros(LENGTH, bool)
     white = naive_fit.whiten(LENGTH, clipped, *whitening) if whitening else np.eye(LENGTH)
     white = white if level_err is None else naive_fit.free_level(white, clipped, level_err)

@@ -271,16 +271,6 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
     return Solution(number, converged, cost, *joined)
 
 
-def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, settings: Settings) -> np.ndarray:
-    """Fall of chi2 that one more echo promises beside the echoes of each cluster, float64 (c,).
-
-    As `decompose_clusters`, with echoes that are the fit itself (docs/algorithms.md 2.3).
-    """
-    promise = np.zeros(len(clusters.number))
-    call("promise_echoes", *_as_problem(samples, echoes, clusters, settings), promise)
-    return promise
-
-
 def _as_problem(
     samples: Samples, candidates: Candidates, clusters: Clusters, settings: Settings
 ) -> tuple[library.Block, library.CClusters, library.CSettings]:
