@@ -95,8 +95,7 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
     if report is not None:
         write_text(report, format_json(figures) + "\n", overwrite=overwrite)
     answer(figures)
-    for note in (*found.notes, *doubt_clouds(paths)):
-        talk(f"warning: {note}")
+    talk(*(f"warning: {note}" for note in (*found.notes, *doubt_clouds(paths))))
     for line in list_lines(calibration_sheet(flight)):
         tell(line)
     tell(f"{output}: written")

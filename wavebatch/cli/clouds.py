@@ -206,8 +206,7 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options), forest=forest)
     found = write_grid(paths, output, how, overwrite=options["overwrite"])
     layout = found.layout
-    for line in doubt_clouds(paths, columns):
-        talk(f"warning: {line}")
+    talk(*(f"warning: {line}" for line in doubt_clouds(paths, columns)))
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
     if found.unnamed:

@@ -356,8 +356,7 @@ class ProgramCommand(click.Command):
                 lines.append(f"--{_option_name(option)} {value} ({place})")
                 shown += lines[-1:] if is_file or not ctx.params.get("quiet") else []
             ctx.meta["wavebatch.settings"] = tuple(lines)
-            for line in _find_strangers(ctx):
-                talk(f"warning: {line}")
+            talk(*(f"warning: {line}" for line in _find_strangers(ctx)))
             if shown:
                 talk(f"settings: {', '.join(shown)}")
         return rest

@@ -108,8 +108,7 @@ def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **
         write_text(output, format_csv(HEAD, list_rows(result.to_json())), overwrite=options["overwrite"])
     parts = [*_list_parts(between), *chains]
     answer(result.to_json(), Sheet("compare", parts), "chains" if strip else "")
-    for line in doubt_clouds([Path(side) for side in (a, b, strip) if side]):
-        talk(f"warning: {line}")
+    talk(*(f"warning: {line}" for line in doubt_clouds([Path(side) for side in (a, b, strip) if side])))
     fewer = min(between.echoes_a, between.echoes_b)
     if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
         common = f"{between.matched} of {fewer} echoes" if between.matched else "no echo"

@@ -152,8 +152,7 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
             counts["cube"] = list(slice_output.write_cube(cube, kept, meta, reader.facts.crs, overwrite=overwrite))
         if writer:
             writer.commit()
-    for line in (*reader.facts.warnings, *scan.mixed):
-        talk(f"{strip}: warning: {line}")
+    talk(*(f"{strip}: warning: {line}" for line in (*reader.facts.warnings, *scan.mixed)))
     if scan.broken:
         talk(f"{strip}: warning: packets of {count(scan.broken, 'point')} cannot be used; `wavebatch check` says why")
     if not counts["lines"]:
@@ -258,8 +257,8 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
                 bar.update(done)
 
             summary = voxelize_strip(strip, targets[strip], settings, progress=show, **more)
-        for line in summary.warnings:  # with --quiet too: they say how far the values can be trusted
-            talk(f"{strip}: warning: {line}")
+        # With --quiet too: they say how far the values can be trusted
+        talk(*(f"{strip}: warning: {line}" for line in summary.warnings))
         for line in _list_lines(summary):
             tell(line)
         return summary

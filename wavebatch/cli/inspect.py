@@ -231,8 +231,7 @@ def stages(name: str | None, **options: Any) -> None:
     from wavebatch.core.echoes import COLUMNS
     from wavebatch.stages.chain import KINDS, STAGES, load_plugins
 
-    for line in load_plugins() if name not in STAGES else ():
-        talk(f"warning: {line}")
+    talk(*(f"warning: {line}" for line in (load_plugins() if name not in STAGES else ())))
     kind = name if name in KINDS else None
     if name is not None and name not in STAGES and kind is None:
         hint = nearest(name, STAGES)

@@ -205,10 +205,11 @@ class NearestGroup(click.Group):
         return super().resolve_command(ctx, args)
 
 
-def talk(message: str) -> None:
-    """One line on stderr, and in the file of --log-file."""
-    write_message(printable(message))
-    log_text(printable(message))
+def talk(*messages: str) -> None:
+    """One line each on stderr, and in the file of --log-file."""
+    for message in messages:
+        write_message(printable(message))
+        log_text(printable(message))
 
 
 def tell(message: str) -> None:

@@ -49,8 +49,7 @@ def draws_clouds(
 
             # Of several lines each is of one cloud; segments and voxels have no counts.
             columns = [options["column"]] if options.get("column") and not options.get("each") else []
-            for line in doubt_clouds(paths, columns):
-                talk(f"warning: {line}")
+            talk(*(f"warning: {line}" for line in doubt_clouds(paths, columns)))
             tell(f"{output}: {text}")
             answer({"output": str(output), "clouds": [str(path) for path in paths], **found})
 
@@ -405,8 +404,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
             draw_waveform_sheet(views, output, times=shown, **more)
         else:
             draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
-    for line in doubt_clouds([strip]):
-        talk(f"warning: {line}")
+    talk(*(f"warning: {line}" for line in doubt_clouds([strip])))
     echoes = sum(len(view.echoes) for view in views)
     tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
     answer({"output": str(output), "chain": name, "waveforms": len(views), "echoes": echoes})

@@ -244,8 +244,7 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     settings = shared.from_options(SynthesisOptions, options, radar=radar)
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
-    for line in doubt_clouds([cloud]):
-        talk(f"{output}: warning: {line}")
+    talk(*(f"{output}: warning: {line}" for line in doubt_clouds([cloud])))
     lines = _list_lines(output, summary, settings)
     print_summary(summary.to_json() if options["as_json"] else summary, lines)
 
