@@ -61,7 +61,7 @@ def check_raster(target: Path, *, overwrite: bool) -> None:
 
 def find_crs_unit(text: str, where: str) -> str:
     """Return the unit of a CRS: m, ft, degree ...; ConfigError if it is not known, or not of plane coordinates."""
-    found = _read_crs(text, where)
+    found = parse_crs(text, where)
     if found.is_geographic:
         return "degree"
     names = {"metre": "m", "meter": "m", "unknown": "m"}
@@ -69,12 +69,8 @@ def find_crs_unit(text: str, where: str) -> str:
     return names.get(unit.lower(), unit)
 
 
-def same_crs(one: str, other: str, where: str) -> bool:
-    """Whether two definitions mean the same CRS; ConfigError as find_crs_unit."""
-    return one == other or _read_crs(one, where) == _read_crs(other, where)
-
-
-def _read_crs(text: str, where: str) -> Any:
+def parse_crs(text: str, where: str) -> Any:
+    """Return a CRS as rasterio has it; ConfigError if it cannot be read, or is geocentric."""
     from rasterio.crs import CRS
     from rasterio.env import Env
 
@@ -144,7 +140,7 @@ class RasterWriter(Closing):
         self._layout = layout
         try:
             with _writing(target):
-                crs = None if layout.crs is None else _flatten(_read_crs(layout.crs, str(target)))
+                crs = None if layout.crs is None else _flatten(parse_crs(layout.crs, str(target)))
                 self._file = rasterio.open(
                     self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
                     dtype=layout.dtype, nodata=layout.no_data, crs=crs, tiled=True, blockxsize=TILE, blockysize=TILE,

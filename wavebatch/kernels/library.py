@@ -348,16 +348,12 @@ def load() -> ctypes.CDLL:
             getattr(library, name).restype = ctypes.c_int64
     except (OSError, AttributeError) as error:
         again = "remove it, it is then built again" if in_checkout else "install wavebatch again on this machine"
+        # What the system says, without the path that the message begins with.
+        reason = (getattr(error, "strerror", None) or str(error)).removeprefix(f"{LIBRARY}: ")
         raise InputError(
-            f"{LIBRARY}: cannot be loaded ({_reason(error)}): it is missing, damaged or of another machine; {again}"
+            f"{LIBRARY}: cannot be loaded ({reason}): it is missing, damaged or of another machine; {again}"
         ) from error
     return library
-
-
-def _reason(error: Exception) -> str:
-    """What the system says, without the path that the message begins with."""
-    text = getattr(error, "strerror", None) or str(error)
-    return text.removeprefix(f"{LIBRARY}: ")
 
 
 def call(name: str, *arguments: Any) -> int:

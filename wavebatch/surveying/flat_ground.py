@@ -141,7 +141,7 @@ def measure_slope(reader: StripReader, scan: StripScan) -> float:
         return 0.0
     some, radius = xyz[:: max(len(xyz) // ENOUGH_SLOPES, 1)], choose_radius(xyz)
     (slope, _), _ = measure_normals(
-        some, np.tile([0.0, 0.0, -1.0], (len(some), 1)), _surround(xyz, radius),
+        some, np.tile([0.0, 0.0, -1.0], (len(some), 1)), Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)]),
         radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR,
     )  # fmt: skip
     known = slope[np.isfinite(slope)]
@@ -158,11 +158,6 @@ def _list_places(reader: StripReader, unit: Unit) -> np.ndarray:
     """Finite positions of the points of a unit [m], f8 (n, 3)."""
     xyz = locate(unit.points, reader.facts.header)
     return xyz[np.isfinite(xyz).all(axis=1)]
-
-
-def _surround(xyz: np.ndarray, radius: float) -> Surroundings:
-    """Points in which neighbours within a radius [m] are looked for."""
-    return Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
 
 
 def choose_radius(xyz: np.ndarray) -> float:
@@ -235,7 +230,7 @@ def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_wa
         rows = rows[:: max(len(rows) * len(chosen) // max(n_waveforms, 1), 1)]
         xyz = _list_places(reader, unit)
         radius = radius or choose_radius(xyz)  # one for all, as a run has it
-        around = _surround(xyz, radius)
+        around = Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
         for block, _ in reader.read_rows(unit, rows, 4096):
             # At the last return of each waveform.
             block = fill.fill(block)

@@ -33,8 +33,11 @@ from wavebatch.surveying.measuring.noise_and_width import (
     measure_quiet,
 )
 from wavebatch.surveying.systems.figures import Kind, Level, Look
-from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, take_strongest, with_pulse
+from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, with_pulse
 from wavebatch.surveying.systems.survey_result import Survey
+
+MOST_ECHOES = 200
+"""Echoes, the strongest ones, in which pulses are compared; more do not change the answer."""
 
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
@@ -178,7 +181,7 @@ def glance_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Glance | 
     for measured in False, True:
         if measured:
             plain = measure_gaussian(block, system.sigma_ref / block.spacing)
-        lone = find_lone(block, plain, most=len(block))
+        lone = find_lone(block, plain)
         width = find_edge(lone.sigma) if len(lone) >= FEW else 0.0
         if abs(width / plain.sigma_ref - 1.0) <= FAR_OFF:
             break
@@ -221,7 +224,7 @@ def look_at(blocks: Sequence[WaveformBlock], system: SystemPulse, seen: Glance |
     block = _pool_main(blocks, system)
     if seen is None or block is None or not seen.look.width:
         return None if seen is None else seen.look
-    strong = take_strongest(seen.lone)
+    strong = seen.lone.take(np.sort(np.argsort(-seen.lone.amplitude, kind="stable")[:MOST_ECHOES]))
     noise = seen.look.level.std / strong.amplitude.astype(np.float64)
     left = quantile(fit_alone(block, with_pulse(seen.plain, system), strong)[0] ** 2 - noise**2, 0.25)
     return replace(seen.look, misfit=float(np.sqrt(max(left, 0.0))))

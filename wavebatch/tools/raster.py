@@ -22,7 +22,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, CheckedOptions, Range, check_options, option
 from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
+from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, parse_crs
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
 from wavebatch.files.las.read_points import read_checked_header
@@ -367,7 +367,7 @@ def write_grid(
                 unnamed.append(path)
                 continue
             unit = find_crs_unit(found, str(path))
-            if first is not None and not same_crs(first[1], found, str(path)):
+            if first and first[1] != found and parse_crs(first[1], str(path)) != parse_crs(found, str(path)):
                 raise ConfigError(f"{path}: has another CRS than {first[0]}; make a raster of each, or give --crs")
             first = first or (path, found)
         crs, unnamed = (None, []) if first is None else (first[1], unnamed)

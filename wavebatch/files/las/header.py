@@ -443,12 +443,6 @@ def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool)
     return wanted
 
 
-def _whole(size: int, length: int) -> np.dtype:
-    """The first bytes of records of some length, as one field."""
-    record: Any = {"names": ["record"], "formats": [f"V{size}"], "offsets": [0], "itemsize": length}
-    return np.dtype(record)
-
-
 def copy_standard(source: np.ndarray, rows: np.ndarray, old: int, new: int) -> None:
     """Copy the standard fields of records (n,) from format `old` to format `new`.
 
@@ -458,7 +452,8 @@ def copy_standard(source: np.ndarray, rows: np.ndarray, old: int, new: int) -> N
     if base_old == base_new:
         wave = old in WITHOUT_WAVES and new in WITHOUT_WAVES
         size = STANDARD_DTYPES[new if wave else base_new].itemsize
-        target, given = (records.view(_whole(size, records.dtype.itemsize)) for records in (rows, source))
+        first: Any = {"names": ["record"], "formats": [f"V{size}"], "offsets": [0]}  # the first bytes, as one field
+        target, given = (records.view(first | {"itemsize": records.dtype.itemsize}) for records in (rows, source))
         target["record"] = given["record"]
         return
     for name in field_names(STANDARD_DTYPES[new]):

@@ -39,10 +39,6 @@ LEAST_ECHOES = 8
 LEAST_SNR = 10.0
 """Least amplitude of these echoes, over the noise: below it noise hides the misfit of any pulse."""
 
-MOST_ECHOES = 200
-"""Echoes, the strongest ones, in which pulses are compared; more do not change the answer."""
-
-
 BEFORE, AFTER = 4.0, 9.0
 """Widths of the pulse before and after an echo in which the misfit is measured: both shipped pulses with their
 after-pulses lie within."""
@@ -96,14 +92,9 @@ def list_known(block: WaveformBlock, system: SystemPulse) -> dict[str, SystemPul
     return {known.name: with_pulse(system, known.system) for known in near}
 
 
-def find_lone(block: WaveformBlock, system: SystemPulse, most: int = MOST_ECHOES) -> EchoTable:
-    """Return the strongest single echoes of a block by Gaussian fits: at most `most`, one per waveform, not clipped."""
-    return take_strongest(fit_lone(block, pooled_noise(block, system), system, LEAST_SNR, fraction=0.5), most)
-
-
-def take_strongest(echoes: EchoTable, most: int = MOST_ECHOES) -> EchoTable:
-    """Return at most `most` echoes, the strongest ones, in their order."""
-    return echoes.take(np.sort(np.argsort(-echoes.amplitude, kind="stable")[:most]))
+def find_lone(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """Return the single echoes of a block by Gaussian fits: one per waveform, not clipped."""
+    return fit_lone(block, pooled_noise(block, system), system, LEAST_SNR, fraction=0.5)
 
 
 def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -147,7 +138,7 @@ def guess_width(block: WaveformBlock, system: SystemPulse) -> SystemPulse | None
     The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all echoes:
     noise makes the strongest of many weak ones both high and narrow.
     """
-    lone = find_lone(block, system, len(block))
+    lone = find_lone(block, system)
     if len(lone) < LEAST_ECHOES:
         return None
     low, middle = quantiles(lone.sigma, (0.25, 0.5))
