@@ -162,3 +162,37 @@ def test_strips_of_a_flight_are_calibrated_with_one_unit_of_energy(tmp_path, fli
     assert done.exit_code == 0, done.output
     found = load_calibration(tmp_path / "cal.toml")
     assert len(found.strips) == 2 and max(abs(row.drift) for row in found.strips) < 0.01
+
+
+def follow(wave):
+    """A gain that halves where the last 50 echoes were twice as bright as usual."""
+    gain, level = np.empty(len(wave)), 70.0
+    for row, top in enumerate(wave.max(axis=1)):
+        level += (top - level) / 50.0
+        gain[row] = 70.0 / level
+    return wave * gain[:, None]
+
+
+@pytest.mark.parametrize(
+    ("receive", "least"),
+    [(follow, 0.12), (lambda wave: 200.0 * wave / wave.max(axis=1, keepdims=True), 0.5), (None, 0.0)],
+    ids=["follows", "scaled", "sound"],
+)
+def test_a_gain_that_follows_the_light_is_named_and_in_the_error(tmp_path, flickering, receive, least):
+    """Values were 15 and 35 % off with 4 % of error, in silence."""
+    plain = replace(FLICKERS, store_energy=False, energy_spread=0.02, time=START + 600)
+    strip = write_strip(tmp_path / "s.las", FARMLAND, plain, 12_000, seed=7, receive=receive)
+    off, stated, said = judge(tmp_path / "out", strip, flickering / "without.toml")
+    assert ("the gain of the receiver follows the light" in said) == (receive is not None)
+    assert np.median(stated) > least and (receive or np.median(stated) < 0.12)
+    share = np.mean(np.abs(off / (1 + off)) < stated)
+    assert share > 0.6
+    done = call("calibrate", strip, "--targets", flickering / "t.csv", "-o", tmp_path / "c.toml")
+    assert ("the gain of the receiver follows the light" in done.stderr) == (receive is not None)
+    assert load_calibration(tmp_path / "c.toml").channels[0].relative_error > least
+
+
+def test_a_gain_that_follows_the_light_is_named_without_a_calibration(tmp_path):
+    strip = write_strip(tmp_path / "s.las", FARMLAND, Sensor(**BASE, light=LIGHT), 12_000, seed=8, receive=follow)
+    done = call("run", strip, "-o", tmp_path / "out", "--columns", "+amplitude_normalized")
+    assert done.exit_code == 0 and "the gain of the receiver follows the light" in done.stderr

@@ -191,7 +191,7 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
                     step = replace(step, parameters={"slope": min(slope, STEEP)})
                 steps.append(step)
             job = replace(job, chain=replace(job.chain, steps=tuple(steps)))
-            if job.calibration is not None or setup.sent.energy is not None:
+            if job.calibration is not None or setup.sent.energy is not None or needs_sensor(job.chain):
                 doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
             chosen = plan_filter(job, layout)

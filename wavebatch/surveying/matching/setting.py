@@ -449,13 +449,13 @@ def _find_fading(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chan
     rest = levels - levels.mean() - middle * (middle @ levels) / (middle @ middle)
     error = weigh_alike(rest) * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) / (middle @ middle)))
     found = [(float(np.sqrt(LEAST_UNLIKE**2 + np.var(slopes) + error**2)), float(np.median(slopes)))]
-    for error, slope in _find_growth_in_cells(time, np.log(light), place):
+    for error, slope in find_growth_in_cells(time, np.log(light), place):
         found.append((float(np.hypot(SAME_GROUND, half * error)), half * slope))
     spread, shift = min(found)
     return weigh_change(shift, spread, chance=chance)
 
 
-def _find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray) -> Iterator[tuple[float, float]]:
+def find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray) -> Iterator[tuple[float, float]]:
     """Yield errors and slopes over time of light in cells of the ground of two sizes: medians over the cells, since a
     field's border in some of them says nothing."""
     for number in CELLS:

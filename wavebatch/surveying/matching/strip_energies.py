@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,30 @@ from wavebatch.files.pulse_energy import COLUMN, LEAST_KNOWN, LEAST_SHARE, Pulse
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import CHANGE_CHANCE, Calibration
-from wavebatch.surveying.matching.setting import QUANTILES, SCANNERS, compare_scenes, take_off_level, weigh_alike
+from wavebatch.surveying.matching.setting import (
+    QUANTILES,
+    SCANNERS,
+    compare_scenes,
+    find_growth_in_cells,
+    take_off_level,
+    weigh_alike,
+)
 
 OTHER_UNIT = 3.0
 """Ratio of mean energies from which a log is in another unit: lasers lose a half of their energy at most."""
 
-NEIGHBOURS = 4096
-"""Neighbouring pulses whose light is compared."""
+NEIGHBOURS, MOST_SAMPLES, BLOCK = 16384, 4_000_000, 2048
+"""Neighbouring pulses whose light is compared: some 20 scan lines of usual sensors; samples that they have at most, and
+waveforms that are read at a time."""
+
+MEMORIES, SURE, HELD = (16, 64, 256, 1024), 3.0, 2.0
+"""Pulses before and after one, whose light shows a receiver that follows it; errors from which it does (real strips and
+sound scenes stay below 2); and by how much its gain varies more than these show: 1 to 3 times in simulated strips."""
+
+ONE_LEVEL, LEAST_LEVEL, SURFACES = 0.84, 100.0, 0.6
+"""Share of the packets whose brightest samples lie within a count of each other where each packet was scaled, fewest
+counts of these, since weak light varies by less, and by how much surfaces of one strip differ in brightness: real and
+simulated ones by 0.1 to 0.9 (robust standard deviation of the logarithm)."""
 
 PERIODS = (2, 3, 4)
 """Lasers, or heads, that may take turns."""
@@ -99,10 +117,11 @@ def take_energies(
     docs/algorithms.md 5.2.
     """
     energy, notes = find_pulse_energy(reader, scan, request), []
-    pulses = np.empty((4, 0))
+    pulses = np.empty((7, 0))
     if reader.unit_count():  # the middle of the strip
         unit = reader.read_unit(reader.unit_count() // 2, scan)
-        pulses = _join(reader, unit, np.flatnonzero(unit.packets.owned)[:NEIGHBOURS], energy)
+        rows = np.flatnonzero(unit.packets.owned)[:NEIGHBOURS]
+        pulses = _join(reader, unit, rows[np.cumsum(unit.packets.n_samples[rows]) <= MOST_SAMPLES], energy)
     growth = 0.0
     if energy is not None and request is not None:
         doubt = judge_energies(pulses[1], pulses[2])
@@ -125,7 +144,7 @@ def take_energies(
     elif energy is not None and energy.known < 1.0:
         chance = CHANGE_CHANCE if calibration is None else calibration.change_chance
         places = _read_places(reader, scan, replace(energy, fills=None))
-        more, alone = _compare_unknown(np.concatenate([np.empty((4, 0)), *places], axis=1), chance)
+        more, alone = _compare_unknown(np.concatenate([np.empty((7, 0)), *places], axis=1), chance)
         energy = replace(energy, fills=math.hypot(energy.fills or 0.0, more))
         found = f"by their light beside that of the others, {100 * more:.1f} % of error hold it"
         others = (
@@ -149,6 +168,14 @@ def take_energies(
         if len(own) > LEAST_COMPARED:
             near, *far = (float(np.nanmedian(np.abs(own[k:] - own[:-k]))) for k in (1, *PERIODS))
             apart = max(apart, near) if near > LEAST_APART and min(far) < LIKE * near else apart
+    follows = _find_following(pulses)
+    if follows:
+        notes.append(
+            "the gain of the receiver follows the light of the last pulses, or packets were scaled one by one: light "
+            f"varies by {100 * follows:.0f} % by it, which errors of calibrated values hold; give the gain of each "
+            "pulse as --energy"
+        )
+        growth = math.hypot(growth, follows)
     if apart:
         notes.append(
             f"the light of neighbouring pulses alternates by a factor of {math.exp(-apart):.2f}, as of two lasers or "
@@ -173,6 +200,32 @@ def take_energies(
     if energy is None:
         return StripEnergies(None, lacks, growth, tuple(notes))
     return StripEnergies(replace(energy, missed=lacks), 0.0, growth, tuple(notes))
+
+
+def _find_following(pulses: np.ndarray) -> float:
+    """By how much a gain varies that follows the light of the last pulses, or of each, relative; 0 where none is seen;
+    pulses: as `_join`.
+
+    Within small cells of the ground, light is compared with that of the pulses before over that of those after: a scene
+    has no direction in time, a receiver has.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found, light = 0.0, pulses[1] / pulses[2]
+        for channel in np.unique(pulses[3]):
+            own = (pulses[3] == channel) & (light > 0.0) & np.isfinite(light + pulses[5] + pulses[6])
+            seen, top = light[own], pulses[4, own] / pulses[2, own]
+            level = float(np.median(top)) if len(top) > LEAST_COMPARED else 0.0
+            if level > LEAST_LEVEL and np.mean(np.abs(top - level) <= 1.0) > ONE_LEVEL:
+                found = SURFACES
+            whole = np.cumsum(np.append(0.0, seen))
+            for size in (memory for memory in MEMORIES if len(seen) > 4 * memory):
+                near = whole[size:] - whole[:-size]
+                before, after = np.log(near[: -size - 1]), np.log(near[size + 1 :])
+                here = np.log(seen[size:-size]), pulses[5:, own][:, size:-size]
+                for error, slope in islice(find_growth_in_cells(before - after, *here), 1):
+                    gain = HELD * -2.0 * slope * float(np.std(before))
+                    found = max(found, gain * (slope < -SURE * error))
+    return found
 
 
 def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[float, str]:
@@ -201,14 +254,18 @@ def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[floa
 
 
 def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy | None) -> np.ndarray:
-    """Time, light, energy (1 where nothing is known) and channel of waveforms in the order of time, f8 (4, n)."""
-    parts = [np.empty((4, 0))]
-    for block, _ in reader.read_rows(unit, rows, NEIGHBOURS):
+    """Time, light, energy (1 where nothing is known), channel, brightest sample over the level and its east and north
+    of waveforms in the order of time, f8 (7, n)."""
+    parts = [np.empty((7, 0))]
+    for block, _ in reader.read_rows(unit, rows, BLOCK):
         given = None if energy is None else energy.fill(block, unit).pulse_energy
         sent = np.ones(len(block)) if given is None else given
         channel = np.full(len(block), SCANNERS * block.digitizer.index)
         channel += 0 if block.scanner is None else block.scanner
-        parts.append(np.stack([block.gps_time, np.nansum(take_off_level(block), axis=1), sent, channel]))
+        above = np.nan_to_num(take_off_level(block))
+        time = block.spacing * np.argmax(above, axis=1)
+        place = (block.origin + block.direction * time[:, None]).T[:2]
+        parts.append(np.stack([block.gps_time, above.sum(axis=1), sent, channel, above.max(axis=1), *place]))
     joined = np.concatenate(parts, axis=1)
     return joined[:, np.argsort(joined[0], kind="stable")]
 
