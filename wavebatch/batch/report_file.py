@@ -512,8 +512,8 @@ def find_warnings(
     if report.above_one > MOST_ABOVE_ONE * known > 0:
         line = (
             f"{min(100 * report.above_one / known, 100):.0f} % of the reflectances exceed 1, that of a white matt "
-            "surface: the calibration is of another sensor or setting, a target's reflectance is wrong, or coordinates are "
-            "not in metres"
+            "surface: the calibration is of another sensor or setting, a target's reflectance is wrong, or coordinates "
+            "are not in metres"
         )
         found += warn("reflectance", [line])
     if choice.doubted and echoes:

@@ -40,7 +40,7 @@ MEMORIES, SURE, HELD = (16, 64, 256, 1024), 3.0, 2.0
 """Pulses before and after one, whose light shows a receiver that follows it; errors from which it does (real strips and
 sound scenes stay below 2); and by how much its gain varies more than these show: 1 to 3 times in simulated strips."""
 
-ONE_LEVEL, LEAST_LEVEL, SURFACES = 0.84, 100.0, 0.6
+ONE_LEVEL, LEAST_LEVEL, SURFACES = 0.84, 50.0, 0.6
 """Share of the packets whose brightest samples lie within a count of each other where each packet was scaled, fewest
 counts of these, since weak light varies by less, and by how much surfaces of one strip differ in brightness: real and
 simulated ones by 0.1 to 0.9 (robust standard deviation of the logarithm)."""
