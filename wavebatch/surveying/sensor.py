@@ -92,6 +92,10 @@ SURE_HEIGHTS, LEAST_HEIGHTS = 4.0, 1e-3
 """Errors from which rays come from several heights: a twelfth of 1,000 rays shows that so, wherever they come from; and
 least standard deviation of these heights that counts, over the distance: drifts of attitude look like a tenth of it."""
 
+OF_JUMP = 2.0
+"""By how much a path jumps where vectors are turned in a part of the strip, over what the line between the neighbours
+shows of it: 0.5 to 3 times, since windows of rays may reach over the jump."""
+
 TURNED = ("turned_deg", "turned_error_deg", "is_turned")
 """Facts of a turn of the packet vectors."""
 
@@ -204,6 +208,7 @@ class SensorSource:
         if facts.get("is_turned"):
             off, error = facts["turned_deg"], facts["turned_error_deg"]
             size = f"{off:.2g} degrees, known to {error:.1g}" if off > error else f"up to {off + error:.1g} degrees"
+            off += error * (off <= error)
             return (
                 f"angles: the packets' vectors are turned against the points by {size}: echoes 10 m from a return are "
                 f"{1000 * np.radians(off):.1g} cm off, and the errors of angles and ranges hold "
@@ -660,6 +665,9 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     if pairs is None:
         return source
     shown, turn, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
+    if jump := path.find_jump(rays.time[0], rays.time[-1]):  # turned in a part of the strip only
+        size = np.hypot(shown["turned_error_deg"], np.degrees(OF_JUMP * jump[1] / distance))
+        shown |= {"turned_error_deg": round(float(size), 4), "is_turned": True}
     back = np.cross(rays.direction, turn)
     straight = rays._replace(direction=rays.direction + back + 0.5 * np.cross(back, turn))
     source = (estimate_path(straight, kind) if turn.any() else None) or source
