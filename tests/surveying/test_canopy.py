@@ -147,9 +147,12 @@ def test_echoes_beside_stronger_ones_at_one_lag_and_ratio_are_counted_beyond_cha
     assert share_repeated(echoes, 2.0) == pytest.approx(share, abs=0.03)
 
 
-@pytest.mark.parametrize(("lag", "scatter", "share"), [(7, 0.2, 0.5), (90, 0.2, 0.5), (7, 1.5, 0.0), (None, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("lag", "scatter", "share"),
+    [(7, 0.1, 0.47), (90, 0.1, 0.47), (2.7, 0.1, 0.47), (-3.3, 0.1, 0.47), (7, 0.3, 0.18), (2.7, 0.5, 0), (None, 0, 0)],
+)
 def test_echoes_at_one_lag_are_counted_whatever_their_ratio(rng, lag, scatter, share):
-    """Second pulses whose height changes from shot to shot, and those a hundred widths later, made 20 to 39 % of the
+    """Second pulses whose height changes from shot to shot, three widths or a hundred later, made 19 to 39 % of the
     echoes false, without a word. A layer below all echoes scatters by more than a part of a pulse."""
     n = 400
     after = rng.exponential(8, n) + 1 if lag is None else lag + scatter * rng.standard_normal(n)

@@ -35,7 +35,7 @@ from wavebatch.surveying.measuring.judge import (
     replace_rows,
     sample_noise,
 )
-from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
+from wavebatch.surveying.measuring.mirror import Mirror, count_holes, look_in_mirror
 from wavebatch.surveying.measuring.misfit import LEAST_MISFIT
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, spread_rows, thin_block
 from wavebatch.surveying.systems.known_systems import MOST_SPREAD
@@ -516,7 +516,8 @@ def settle(
             break
     best = max(tried, key=lambda one: one[1].worth)
     first = tried[0][1]
-    return *(best if best[1].worth - first.worth > GAINED * first.echoes else tried[0]), doubt
+    found, mirror = best if best[1].worth - first.worth > GAINED * first.echoes else tried[0]
+    return found, replace(mirror, quiet=max(mirror.quiet, count_holes(system, explained, part.spacing))), doubt
 
 
 def _choose_misfit(

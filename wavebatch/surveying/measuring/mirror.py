@@ -14,9 +14,12 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.detect.direct import matched_filter, maximum
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.judge import SEARCH, Explained
+from wavebatch.surveying.measuring.misfit import MOST_FAINT
+from wavebatch.surveying.measuring.noise_and_width import HOLDS
 from wavebatch.surveying.measuring.residuals import find_echoes
 
 STRONG = 30.0
@@ -28,6 +31,10 @@ that of the waveform [full widths at half maximum]."""
 
 WORTH = 0.2
 """Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
+
+
+LACK = 0.3
+"""Share of the echoes within ZONE that a hole must be deeper than: neighbours that are not told apart leave less."""
 
 
 @frozen
@@ -91,6 +98,36 @@ def look_in_mirror(
     for level in levels:
         most = [max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True)]
         yield level, Mirror(len(mains), most[0], int(np.count_nonzero(energy >= level)), most[1])
+
+
+def count_holes(system: SystemPulse, explained: Explained, spacing: float) -> int:
+    """Count places where waveforms lie further below their echoes than noise or an error of the pulse can.
+
+    Light only adds. Interference and bipolar spikes go down as often as up, where the mirror does not see them: beside
+    the echoes that their upper halves became.
+
+    Parameters
+    ----------
+    system : SystemPulse
+    explained : Explained
+        Waveforms decomposed with it.
+    spacing : float
+        Of their samples [ns].
+    """
+    sums, width = explained.sums, system.sigma_ref / spacing
+    taps = gaussian_taps(width)
+    energy = filter_energy(taps)
+    left = np.where(sums.used, sums.left, np.float32(0))
+    depth = np.pad(filter_symmetric(left.T, taps).T / np.float32(-energy), ((0, 0), (1, 1)))
+    top = sums.model.max(axis=1, keepdims=True)
+    least = np.maximum(HOLDS * system.noise.std / np.sqrt(energy), MOST_FAINT * top)
+    middle = depth[:, 1:-1]
+    row, place = np.nonzero((middle > least) & (middle >= depth[:, :-2]) & (middle > depth[:, 2:]))
+    reach = int(np.ceil(ZONE * FWHM_PER_SIGMA * width))
+    near = np.clip(place[:, None] + np.arange(-reach, reach + 1), 0, middle.shape[1] - 1)
+    highest = sums.model[row[:, None], near].max(axis=1, initial=0.0)
+    noise = HOLDS * np.sqrt((system.noise.std**2 + system.noise.gain * highest) / energy)
+    return int(np.count_nonzero(middle[row, place] > np.maximum(noise, LACK * highest)))
 
 
 def _measure_energy(echoes: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:

@@ -108,9 +108,10 @@ beyond which some are none: in simulated scenes .15 at most, with pulses whose s
 WEAKER, REACH = 0.5, 15
 """Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
 
-NEAREST, ASIDE = 4.5, (-3.0, -1.5, 1.5, 3.0)
-"""Distance from which echoes of one lag, half as high as WEAKER at most, are counted, and lags beside it where others
-are as often [system widths]. Nearer ones merge, so that the lags where they do not seem frequent."""
+NEAREST, SAME_LAG, ASIDE = 2.0, 0.25, (-1.0, -0.5, 0.5, 1.0)
+"""Distance from which echoes of one lag, half as high as WEAKER at most, are counted: nearer ones merge. Distance up to
+which lags are the same, as errors of the faintest echoes scatter them, and lags beside it where others are as often:
+layers of a scene that scatter by .3 are there too [system widths]."""
 
 SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
 """Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
@@ -270,10 +271,11 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
             chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
             most = max(most, 2 * float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
     lag = np.sort(np.concatenate(weak))
-    centre = np.arange(-NEAREST, NEAREST, 0.25) if not len(lag) else np.arange(lag[0] - 1, lag[-1] + 1, 0.25)
-    place = centre[np.abs(centre) > NEAREST, None] + np.array([0.0, *ASIDE])
-    number = np.searchsorted(lag, place + 0.5) - np.searchsorted(lag, place - 0.5)
-    beside = np.max(number[:, 1:], axis=1)
+    first, last = (lag[0], lag[-1]) if len(lag) else (0.0, 0.0)
+    centre = np.arange(first, last + SAME_LAG, SAME_LAG / 2)
+    place = centre[np.abs(centre) >= NEAREST, None] + np.array([0.0, *ASIDE])
+    number = np.searchsorted(lag, place + SAME_LAG) - np.searchsorted(lag, place - SAME_LAG)
+    beside = number[:, 1:].max(axis=1)
     more = number[:, 0] - beside
     more = more[(more >= FEW) & (more > SURE * np.sqrt(number[:, 0] + beside))]
     return max(most, float(more.max(initial=0))) / max(len(echoes), 1)

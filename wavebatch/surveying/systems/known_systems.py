@@ -271,7 +271,8 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     noisy = not reason and made > MADE_BY_NOISE and many
     if noisy:
         reason = f"that noise made {100 * made:.0f} of 100 echoes"
-        remedy = "it may differ between waveforms, or baselines are not level: draw some with `wavebatch plot waveform`"
+        remedy = "some waveforms may have more noise or interference, or baselines are not level: "
+        remedy += "draw some with `wavebatch plot waveform`"
     if reason:
         code, guess = "pulse-guess", f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
         if unseen or hidden or noisy:
