@@ -40,10 +40,10 @@ MEMORIES, SURE, HELD = (16, 64, 256, 1024), 3.0, 2.0
 """Pulses before and after one, whose light shows a receiver that follows it; errors from which it does (real strips and
 sound scenes stay below 2); and by how much its gain varies more than these show: 1 to 3 times in simulated strips."""
 
-ONE_LEVEL, LEAST_LEVEL, SURFACES = 0.84, 50.0, 0.6
-"""Share of the packets whose brightest samples lie within a count of each other where each packet was scaled, fewest
-counts of these, since weak light varies by less, and by how much surfaces of one strip differ in brightness: real and
-simulated ones by 0.1 to 0.9 (robust standard deviation of the logarithm)."""
+SAME_TOP, SURFACES = 0.84, 0.6
+"""Share of the packets whose one brightest sample is the same number where each packet was scaled, which noise does not
+leave; and by how much surfaces of one strip differ in brightness: real and simulated ones by 0.1 to 0.9 (robust
+standard deviation of the logarithm)."""
 
 PERIODS = (2, 3, 4)
 """Lasers, or heads, that may take turns."""
@@ -214,8 +214,7 @@ def _find_following(pulses: np.ndarray) -> float:
         for channel in np.unique(pulses[3]):
             own = (pulses[3] == channel) & (light > 0.0) & np.isfinite(light + pulses[5] + pulses[6])
             seen, top = light[own], pulses[4, own] / pulses[2, own]
-            level = float(np.median(top)) if len(top) > LEAST_COMPARED else 0.0
-            if level > LEAST_LEVEL and np.mean(np.abs(top - level) <= 1.0) > ONE_LEVEL:
+            if len(top) > LEAST_COMPARED and np.median(top) and np.mean(top == np.median(top)) > SAME_TOP:
                 found = SURFACES
             whole = np.cumsum(np.append(0.0, seen))
             for size in (memory for memory in MEMORIES if len(seen) > 4 * memory):
@@ -254,18 +253,18 @@ def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[floa
 
 
 def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy | None) -> np.ndarray:
-    """Time, light, energy (1 where nothing is known), channel, brightest sample over the level and its east and north
-    of waveforms in the order of time, f8 (7, n)."""
+    """Time, light, energy (1 where nothing is known), channel, brightest sample (0 where several are), its east and
+    north of waveforms in the order of time, f8 (7, n)."""
     parts = [np.empty((7, 0))]
     for block, _ in reader.read_rows(unit, rows, BLOCK):
         given = None if energy is None else energy.fill(block, unit).pulse_energy
         sent = np.ones(len(block)) if given is None else given
         channel = np.full(len(block), SCANNERS * block.digitizer.index)
         channel += 0 if block.scanner is None else block.scanner
-        above = np.nan_to_num(take_off_level(block))
-        time = block.spacing * np.argmax(above, axis=1)
-        place = (block.origin + block.direction * time[:, None]).T[:2]
-        parts.append(np.stack([block.gps_time, above.sum(axis=1), sent, channel, above.max(axis=1), *place]))
+        above, top = np.nan_to_num(take_off_level(block)), block.samples.max(axis=1)
+        alone = (block.samples == top[:, None]).sum(axis=1) == 1
+        place = (block.origin + block.direction * (block.spacing * np.argmax(above, axis=1))[:, None]).T[:2]
+        parts.append(np.stack([block.gps_time, above.sum(axis=1), sent, channel, top * alone, *place]))
     joined = np.concatenate(parts, axis=1)
     return joined[:, np.argsort(joined[0], kind="stable")]
 
