@@ -330,6 +330,24 @@ def test_a_link_to_a_strip_that_was_given_is_named(places):
     assert lines[0] in done.stderr
 
 
+def test_a_folder_loses_no_file_without_a_word(places, monkeypatch):
+    """A link to a disk that is not there, and a subfolder that may not be read: both were passed over, exit code 0."""
+    (places / "far.las").symlink_to(places / "mnt" / "far.las")
+    (places / "away.las").symlink_to(places / "away.las")
+    assert _names([str(places)]) == ["a.LAZ", "away.las", "b.las", "far.las"]
+    done = run_command("check", places)
+    assert done.exit_code == 1 and "far.las: cannot be read: No such file" in done.stdout
+    walk = os.walk
+
+    def refuse(folder, onerror):
+        yield next(walk(folder))
+        onerror(PermissionError(13, "Permission denied", str(places / "sub")))
+
+    monkeypatch.setattr(os, "walk", refuse)
+    found = find_files([str(places)], recursive=True)
+    assert found[0] == places / "sub" and [path.name for path in found[1:]] == ["a.LAZ", "away.las", "b.las", "far.las"]
+
+
 def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(places):
     (places / "sub" / "b.laz").write_bytes(b"")
     arguments = [str(places), str(places / "sub")]

@@ -47,7 +47,7 @@ def read_text(path: Path | str, what: str, most: int = MOST_BYTES) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: {what} is not UTF-8 text (byte {error.start})") from error
+        raise ConfigError(f"{path}: {what} is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
 
 
 def _read(path: Path | str, most: int) -> bytes:
@@ -110,7 +110,8 @@ def find_files(
 ) -> list[Path]:
     """Return the files of the arguments, each once, in the order of the arguments.
 
-    A folder gives its LAS and LAZ files by name; recursive: with those of all its subfolders, but not of hidden ones.
+    A folder gives its LAS and LAZ files by name; recursive: with those of all its subfolders, but not of hidden ones
+    and not of links to folders, which may lead in a circle.
     `@list.txt` holds one argument per line, relative to the folder of the list; empty lines and lines that start with #
     are skipped. `@-` is a list from stdin. A file that does not exist or a folder that cannot be read is kept: it fails
     in its turn, so that the other files are still processed.
@@ -169,10 +170,11 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
     if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
         with contextlib.suppress(ValueError):  # no user can have this name
             path = folder / os.path.expanduser(argument)
+    closed: list[str] = []  # folders that cannot be read: they fail in their turn
     if os.path.isdir(path):
         try:
-            names = _walk(path) if recursive else os.listdir(path)
-        except OSError:  # it fails in its turn
+            names = _walk(path, closed) if recursive else os.listdir(path)
+        except OSError:
             yield path
             return
         found, problem = sorted(path / name for name in names), f"{path}: the folder holds"
@@ -181,22 +183,29 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
         return
     else:
         found, problem = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))], f"{argument}: matches"
+    yield from map(Path, closed)
     for suffixes in kinds:
-        chosen = [entry for entry in found if entry.suffix.lower() in suffixes and os.path.isfile(entry)
-                  and not entry.name.startswith(".")]  # fmt: skip
+        # A link to nothing fails in its turn: the disk that it leads to may be missing.
+        chosen = [entry for entry in found if entry.suffix.lower() in suffixes and not entry.name.startswith(".")
+                  and (os.path.isfile(entry) or not os.path.exists(entry))]  # fmt: skip
         if chosen:
             yield from chosen
             return
+    if closed:
+        return
     *names, last = [suffix for suffixes in kinds for suffix in suffixes]
     hint = "; --recursive takes those of its subfolders too" if os.path.isdir(path) and not recursive else ""
     raise ConfigError(f"{problem} no {' or '.join(filter(None, (', '.join(names), last)))} file{hint}")
 
 
-def _walk(folder: Path) -> list[str]:
-    """All files of a folder and its subfolders, relative to it; raises OSError where it cannot be read."""
+def _walk(folder: Path, closed: list[str]) -> list[str]:
+    """All files of a folder and its subfolders, relative to it; raises OSError where it cannot be read.
+
+    closed: gets the subfolders that cannot be read.
+    """
     os.listdir(folder)  # os.walk would say nothing
     found = []
-    for place, folders, files in os.walk(folder):
+    for place, folders, files in os.walk(folder, onerror=lambda error: closed.append(error.filename)):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         found += [os.path.relpath(os.path.join(place, name), folder) for name in files]
     return found
