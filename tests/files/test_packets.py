@@ -396,6 +396,23 @@ def scan_of(path, **options):
         return scan
 
 
+def test_stretches_apart_are_named_one_by_one(strips, tmp_path):
+    """From the first to the last one were named: the packets between them are right."""
+    strip = swap(strips["forest"], strips["forest"], tmp_path)
+    content = bytearray((tmp_path / "s.wdp").read_bytes())
+    with StripReader(strip) as reader, reader.scan() as scan:
+        points = reader.read_points(0, scan.points)
+    size = int(points["wavepacket_size"].max())
+    for share in (0.1, 0.6):
+        first, last = (int(points["wavepacket_offset"][int(part * len(points))]) for part in (share, share + 0.25))
+        content[first:last] = content[first + 5 * size : last] + content[first : first + 5 * size]
+    (tmp_path / "s.wdp").write_bytes(content)
+    (line,) = scan_of(strip).mixed
+    low, high, again, end = (int(found) / len(points) for found in re.search(
+        r"around (\d+) to (\d+), (\d+) to (\d+) are not theirs", line).groups())  # fmt: skip
+    assert 0.05 < low < 0.2 < high < 0.4 and 0.55 < again < 0.7 < end < 0.9
+
+
 @pytest.mark.parametrize("toward", [True, False])
 @pytest.mark.parametrize("most_returns", [1, 3])
 def test_either_sign_gives_the_same_rays(tmp_path, toward, most_returns):

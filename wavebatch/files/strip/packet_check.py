@@ -228,16 +228,20 @@ def is_strange(table: np.ndarray, errors: float = 4.0) -> bool:
     return all(abs(_correlate(table[:, one], table[:, other])) < MOST_ALIKE for one, other in pairs)
 
 
-def find_strange(table: np.ndarray) -> tuple[int, int] | None:
-    """Return the first and the last point of the stretches where `is_strange` holds, of a strip where it does not.
+def find_strange(table: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and the last point of each stretch where `is_strange` holds, of a strip where it does not.
 
     It gives a warning, no refusal, so that two standard errors do: by them no stretch of 32 simulated strips, with
     noises of 1 to 30, and of the real ones is strange, with or without intensities.
     """
     table = table[np.argsort(table[:, _POINT], kind="stable")]
     parts = np.array_split(table, max(len(table) // STRETCH, 1))
-    points = [part[[0, -1], _POINT] for part in parts if is_strange(part, errors=2.0)]
-    return (int(points[0][0]), int(points[-1][1])) if points else None
+    strange = [is_strange(part, errors=2.0) for part in parts]
+    found: list[tuple[int, int]] = []
+    for part, before, now in zip(parts, [False, *strange], strange, strict=False):
+        if now:
+            found.append((found.pop()[0] if before else int(part[0, _POINT]), int(part[-1, _POINT])))
+    return found
 
 
 def _correlate(a: np.ndarray, b: np.ndarray) -> float:

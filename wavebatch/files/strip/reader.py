@@ -184,9 +184,10 @@ class StripReader(Closing):
         chance = "lie on echoes no more often than by chance, and are not as strong as these"
         if packet_check.is_strange(table):
             return f"{file.name} belongs to another strip: in a sample of {len(table)} packets, returns {chance}", ()
-        if (points := packet_check.find_strange(table)) is None:
+        points = ", ".join(f"{first} to {last}" for first, last in packet_check.find_strange(table))
+        if not points:
             return "", ()
-        where = f"{file.name}: packets of points around {points[0]} to {points[1]} are not theirs"
+        where = f"{file.name}: packets of points around {points} are not theirs"
         return "", (f"{where}: returns {chance}; get the file again",)
 
     def _sample_returns(self, scan: StripScan, n_waveforms: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
