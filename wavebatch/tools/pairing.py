@@ -181,7 +181,7 @@ def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, held
         found = np.zeros(len(times), bool)
         for piece in long.read_pieces():
             found |= np.isin(times, piece["gps_time"])
-            if found.mean() > LEAST_SHARED:
+            if np.count_nonzero(found) > LEAST_SHARED * len(times):
                 break
         else:
             by_time = not len(times)
