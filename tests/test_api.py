@@ -394,6 +394,7 @@ def test_read_cloud_reads_only_what_is_asked_for(clouds):
     with pytest.raises(wb.ConfigError, match="has no column 'echo_wdth'; did you mean 'echo_width'"):
         wb.read_cloud(clouds[0] / "urban.laz", ["echo_wdth"])
     refuses(wb.InputError, "nothing.laz", wb.read_cloud, clouds[0] / "nothing.laz")
+    refuses(wb.ConfigError, "columns: 1 is no name", wb.read_cloud, clouds[0] / "urban.laz", [1])
 
 
 # Real data

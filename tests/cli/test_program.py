@@ -46,7 +46,8 @@ def _commands():
 def test_every_page_of_help_has_examples_and_every_option_once(title):
     command = dict(_commands())[title]
     shown = invoke(*title.split(), "--help").stdout
-    assert " RANGE" not in shown, "click's name of a number between limits"
+    assert not re.findall(r" (?:RANGE|FLOAT|INTEGER|TEXT|PATH)\b", shown), "click's names, which say no unit"
+    assert not re.findall(r"(?m)^  [a-z]+  .*\.\.\.$", shown), "the list of commands cuts no sentence"
     if not isinstance(command, click.Group):
         assert isinstance(command, ProgramCommand) and "Examples:" in shown and command.examples
     shown = shown[re.search(r"(?m)^[A-Z][\w ]+:\n  -", shown).start() :]

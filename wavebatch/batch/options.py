@@ -125,7 +125,7 @@ class RunOptions:
         "auto", "Direction of the packet vectors: toward or away from the sensor; auto finds it from the file.", READING
     )
     headerless: bool = option(False, "Read a .wdp file that lacks its 60-byte header.", READING)
-    recursive: bool = option(False, "Also take the files in subfolders of folders, but not of links to folders.", READING)
+    recursive: bool = option(False, "Also take the files in subfolders, but not of links to folders.", READING)
     trajectory: Path | str | None = option(
         None, "Trajectory of the sensor: text with columns time, x, y, z, or SBET. Without it the sensor position is "
         "estimated from the packet vectors.", SENSOR, "FILE", usual=True,

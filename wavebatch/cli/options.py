@@ -221,7 +221,7 @@ def _plain(limit: float) -> float | None:
     """A limit as the help shows it."""
     if math.isinf(limit):
         return None
-    return int(limit) if limit % 1 == 0 and abs(limit) < 1e7 else limit
+    return int(limit) if limit % 1 == 0 and abs(limit) < 1e16 else limit
 
 
 def where_option(text: str) -> Callable:

@@ -84,7 +84,7 @@ def read_range(text: str) -> tuple[float, ...]:
 
 
 @draws_clouds(
-    click.option("--column", required=True, shell_complete=complete("columns"),
+    click.option("--column", required=True, metavar="NAME", shell_complete=complete("columns"),
                  help="Extra dimension or standard field; echo_flags counts flags."),
     click.option("--by", metavar="COLUMN", shell_complete=complete("columns"),
                  help="Draw one line per value of this column, e.g. number_of_returns or classification."),
@@ -140,7 +140,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
 
 
 @draws_clouds(
-    click.option("--column", shell_complete=complete("columns"),
+    click.option("--column", metavar="NAME", shell_complete=complete("columns"),
                  help="Extra dimension or standard field; not needed for count and density."),
     click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]),
                  default="mean", show_default=True,
@@ -201,7 +201,7 @@ _ENDS = "X0,Y0,X1,Y1"
                  help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]"),
     click.option("--width", type=float, metavar="W",
                  help="Show what lies within half of W from the line.  [default: a fiftieth of its length]"),
-    click.option("--column", shell_complete=complete("columns"),
+    click.option("--column", metavar="NAME", shell_complete=complete("columns"),
                  help="Column for the colours.  [default: z; energy for voxels]"),
     click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
                  help="Exaggerate heights F times."),
@@ -233,7 +233,7 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
 
 
 @draws_clouds(
-    click.option("--column", shell_complete=complete("columns"),
+    click.option("--column", metavar="NAME", shell_complete=complete("columns"),
                  help="Column for --statistic sum and mean, e.g. energy."),
     click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
                  help="Of the points or voxels of a height.  [default: sum with --column, else count]"),
@@ -243,7 +243,7 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     find=functools.partial(_find, or_segments=True),
 )  # fmt: skip
 def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Draw how many points, or how much of a column, of CLOUDs, voxels or segments lie at each height.
+    """Draw points, voxels or segments, or a column, by height.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
     voxelize`; or .csv or .geojson files of `wavebatch slice` (a folder gives these where it has no clouds), whose
@@ -279,9 +279,10 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
 @click.option("--t", type=float, metavar="NS", help="Slice of all pulses at one time [ns].")
 @shared.common_options("overwrite", "json")
 def cube(cube_file: Path, output: Path, **options: Any) -> None:
-    """Draw slices of a data cube of `wavebatch slice --cube`: x (pulse), y (scan line) and t (time).
+    """Draw slices of a data cube of `wavebatch slice --cube`.
 
-    Each given option adds a slice; without any, the middle ones are drawn, and the time with the most signal.
+    A cube has the axes x (pulse), y (scan line) and t (time). Each given option adds a slice; without any, the middle
+    ones are drawn, and the time with the most signal.
 
     Exit code: 0 done, 1 the cube cannot be read or the picture cannot be written, 2 wrong usage.
 
@@ -313,7 +314,7 @@ def plot() -> None:
 
 @plot.command()
 @shared.strip_argument
-@output_option
+@shared.output_option("Picture to write: .png, .svg or .pdf; or a table of the echoes: .csv.")
 @click.option("--packet", "packets", multiple=True, metavar="N|FIRST:END",
               callback=lambda context, parameter, texts: tuple(map(shared.parse_span, texts)),
               help="Draw these packets, counted from 0; END is not included; may be repeated.  [default: six, spread "
@@ -342,7 +343,7 @@ def plot() -> None:
 @shared.strip_options
 @shared.common_options("overwrite", "json")
 def waveform(strip: Path, output: Path, **options: Any) -> None:
-    """Draw waveforms of STRIP with their fit, residual and echoes; or write the echoes as a table.
+    """Draw waveforms of STRIP with their fit, or write their echoes.
 
     Shows samples, baseline and noise, the fitted sum, the pulse of each echo, the residual in standard deviations of
     the noise, echoes with their errors, and the returns of the file. The chain is chosen and run as by `wavebatch run`.

@@ -157,9 +157,11 @@ _output = shared.output_option("Strip to write: .las or .laz.")
 @shared.options_of(Recording, default=None)
 @click.option("--pulse", type=click.Choice(list(simulation.PULSES)),
               help="Shape of the system pulse.  [default: gaussian]")
-@click.option("--sigma", type=float, help="Standard deviation of the pulse's main lobe [ns].  [default: the scene's]")
-@click.option("--kappa", type=float, help="Skew of the main lobe.  [default: 0]")
-@click.option("--ringing", default=0.0, help="Share of the amplitude in lobes 4 and 8 sigma after the peak.")
+@click.option("--sigma", type=float, metavar="NS",
+              help="Standard deviation of the pulse's main lobe [ns].  [default: the scene's]")
+@click.option("--kappa", type=float, metavar="KAPPA", help="Skew of the main lobe.  [default: 0]")
+@click.option("--ringing", default=0.0, metavar="SHARE",
+              help="Share of the amplitude in lobes 4 and 8 sigma after the peak.")
 @shared.options_of(simulation.StripOptions)
 @click.option("--sensor", type=click.Choice(["waveform", "discrete"]), default="waveform", show_default=True,
               help="waveform: record every waveform; discrete: record only returns, by a receiver with a dead zone.")

@@ -120,7 +120,7 @@ def _writing(target: Path) -> Iterator[None]:
             yield
     except (rasterio.errors.RasterioError, OSError) as error:
         reason = str(error.__cause__ or error).removesuffix(".")
-        raise InputError(f"{target}: cannot be written: {reason}; check disk and permissions") from error
+        raise InputError(f"{target}: cannot be written: {reason}; free space or check permissions") from error
 
 
 class RasterWriter(Closing):

@@ -376,6 +376,8 @@ class _TableReader(ColumnReader):
         names |= {ours.get(field, field): field for field in self.extra}
         chosen = names if columns is None else columns
         with undoing(self.close):
+            if wrong := [name for name in chosen if not isinstance(name, str)]:
+                raise ConfigError(f"columns: {wrong[0]!r} is no name; give texts, such as 'amplitude'")
             found = {name: self.find_column(names.get(name, name), stored=name in names) for name in chosen}
         self._readers = {name: read for name, (_, read) in found.items()}
         self._stored = {name: facts.name for name, (facts, _) in found.items()}

@@ -282,7 +282,7 @@ class Recording:
         1.0, "Time between samples [ns].", form="NS", unset="1"
     )  # descriptors hold it in 32 bits of picoseconds
     bits: Literal[8, 16, 32] = option(8, "Bits per sample.", unset="8")
-    baseline: float = option(12.0, "Level without signal [DN].", unset="12")
+    baseline: float = option(12.0, "Level without signal [DN].", form="DN", unset="12")
     baseline_spread: float = 0.4
     """Standard deviation of the level between waveforms [count]."""
     noise_std: Annotated[float, Range(0.0, MOST_NOISE)] = option(
@@ -290,13 +290,13 @@ class Recording:
         unset="the scene's, 1 or 1.2",
     )  # fmt: skip
     rho: float = option(
-        0.0, "Correlation of the noise of neighbouring samples: 0, .5, .667, .75 or .8.", unset="0"
+        0.0, "Correlation of the noise of neighbouring samples: 0, .5, .667, .75 or .8.", form="RHO", unset="0"
     )  # m/(m+1), m = 1, 2, ...: binomial filters
     noise_gain: Annotated[float, Range(0.0, 1e6)] = option(
         0.0, "Noise variance that the signal adds [DN2 per DN].", form="DN", unset="0"
     )
     saturation: int | None = option(
-        None, "Count at which the receiver saturates [DN].", unset="the largest that the bits can hold"
+        None, "Count at which the receiver saturates [DN].", form="DN", unset="the largest that the bits can hold"
     )
     pulse: PulseModel = field(default_factory=PulseModel)
 

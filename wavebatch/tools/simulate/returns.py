@@ -97,7 +97,7 @@ class SynthesisOptions:
     )  # fmt: skip
     spacing: Annotated[float, Range(0.001, 4000.0)] = option(1.0, "Time between samples [ns].", form="NS")
     bits: Literal[8, 16, 32] = option(8, "Bits per sample.")
-    baseline: float = option(12.0, "Level without signal [DN].")
+    baseline: float = option(12.0, "Level without signal [DN].", form="DN")
     noise: Annotated[float, Range(0.0, MOST_NOISE)] = option(
         0.0, "Standard deviation of the noise before rounding [DN].", form="DN"
     )
