@@ -274,6 +274,23 @@ def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_pat
     assert stated == pytest.approx(growth, abs=0.1)
 
 
+def test_thinned_points_over_ground_in_common_are_no_other_rate_of_pulses(tmp_path, calibrated, rng):
+    """An eighth of the pulses had an error of 208 %, and a random tenth one of 42 %, as of another energy."""
+    step = np.cumsum(np.where(rng.uniform(size=5000) < 0.1, 1.0, 0.0))
+    times = 1e-4 * np.flatnonzero(np.diff(step, prepend=0.0))
+    facts = SimpleNamespace(header=SimpleNamespace(point_count=len(times)))
+    reader = SimpleNamespace(facts=facts, read_points=lambda start, stop: {"gps_time": times[start:stop]})
+    assert setting._measure_rate(reader) == pytest.approx(1e4, rel=1e-3)
+    with StripReader(calibrated / "a.las") as strip, strip.scan() as scan:
+        source = sensor.find_sensor(strip, scan, sensor.SensorRequest())
+        found = setting.measure_setting(strip, scan, source, 0.22)
+    known = load_calibration(calibrated / "cal.toml")
+    for rate, places, grows in ((0.125, found.places, False), (8.0, found.places, True), (0.125, {}, True)):
+        seen = found._replace(rate=rate * known.rate, places=places)
+        growth, lines, _ = compare_setting(known, seen, SystemPulse(2.0))
+        assert (growth > 2.0) == grows == bool(lines)
+
+
 @pytest.mark.slow
 def test_noise_alone_over_ground_in_common_is_sunlight(tmp_path, calibrated):
     """The ground shows that light is the same: noise twice as large gave 62 % of error."""
@@ -956,7 +973,7 @@ def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, ca
     monkeypatch.setattr(sensor, "measure_scale", lambda reader, scan: PairScale(3.281))
     metres = SimpleNamespace(is_metric=True, horizontal=1.0)
     with StripReader(calibrated / "a.las") as reader, reader.scan() as scan:
-        facts = SimpleNamespace(path="a.las", units=[metres], header=reader.facts.header)
+        facts = SimpleNamespace(path="a.las", units=[metres], header=reader.facts.header, crs=None)
         with pytest.raises(InputError, match="coordinates are in feet, packet vectors in metres"):
             sensor.refuse_units(SimpleNamespace(facts=facts), scan)
 
@@ -988,6 +1005,33 @@ def name_crs(path, code):
     (packets,) = struct.unpack_from("<Q", content, 227)
     struct.pack_into("<Q", content, 227, packets + len(record))
     path.write_bytes(content[:begin] + record + content[begin:])
+
+
+@pytest.mark.parametrize("stretch", [1.5, 0.97, 1.0])
+def test_maps_that_are_stretched_are_refused_by_their_vectors(tmp_path, calibrated, stretch):
+    """On a map of the web (latitude 48) ranges were 6 m and slopes 3 degrees wrong, with errors of 2 mm and .1."""
+
+    def pull(stored):
+        stored.ray, stored.origin = stored.ray * [stretch, stretch, 1], stored.origin * [stretch, stretch, 1]
+
+    write_strip(tmp_path / "s.las", FARMLAND, SENSOR, 2000, seed=64, store=pull)
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", "--calibration", calibrated / "cal.toml")
+    assert (f"packet vectors are {stretch:.3f} times as long across as upwards" in done.stderr) == (stretch != 1.0)
+    assert done.exit_code == (0 if stretch == 1.0 else 4)
+
+
+@pytest.mark.parametrize("code", [3857, 32632])
+def test_maps_that_are_stretched_are_refused_by_their_crs(tmp_path, calibrated, code):
+    strip = tmp_path / "a.las"
+    strip.write_bytes((calibrated / "a.las").read_bytes())
+    name_crs(strip, code)
+    done = call("run", strip, "-o", tmp_path / "out", "--columns", "+range")
+    assert ("of a Mercator projection, whose metres are 1.38 times" in done.stderr) == (code == 3857)
+    assert done.exit_code == (4 if code == 3857 else 0)
+    parts = ('PROJCS["WGS 84 / Pseudo-Mercator",GEOGCS[],PROJECTION["Mercator_1SP"]', 'METHOD["Mercator (variant A)"')
+    assert all(sensor.MERCATOR.search(text) for text in parts)
+    for name in ("Transverse_Mercator", "Hotine_Oblique_Mercator"):
+        assert not sensor.MERCATOR.search(f'PROJCS["Mercator",GEOGCS[],PROJECTION["{name}"]')
 
 
 def test_strips_of_two_zones_are_not_tied(tmp_path, dim_edges):

@@ -6,6 +6,7 @@ Before you change it: positions must depend on the strip and the request alone, 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -49,11 +50,20 @@ LARGEST_ANGLE = np.radians(2.0)
 """Largest angle between packet vectors and rays from a trajectory, but for a tenth of them; above it, strip, clock or
 CRS differ."""
 
+PROJECT = "project the strip to metres, or leave out the stages that measure in metres"
+
 FOOT = 0.3048
 """International foot [m]."""
 
 LEAST_OVERLAPS = 3
 """Smallest number of overlapping windows whose positions show by how much the motion leaves the fits' polynomials."""
+
+MERCATOR = re.compile(r'(?:projection|method)\s*\[\s*"(?:mercator|popular)|^epsg:(?:3857|3395)\b', re.IGNORECASE)
+"""WKT, or code, of the projections of web maps and sea charts, whose metres are longer than those on the ground."""
+
+EARTH, STRETCHED, OFF_LINE = 6_378_137.0, 0.01, 1e-3
+"""Radius of the Earth [m]; stretch of a map above which ranges and slopes are wrong: maps for surveys have 0.001; and
+share of the variance by which vectors may be off the line that shows it: those of real strips are off by 1e-5."""
 
 JERK, JERK_LEFT = 1.0, 0.025
 """Change of acceleration of an aircraft in turbulent air [m/s3], assumed where fewer windows overlap; and what a
@@ -268,6 +278,12 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     """
     refuse_units(reader, scan)
     vectors, pairs = sample_rays(reader, scan)
+    if stretch := _measure_stretch(vectors.direction):
+        raise InputError(
+            f"{reader.facts.path}: packet vectors are {stretch:.3f} times as long across as upwards, so that angles "
+            "and ranges would be wrong: their map is stretched, as those of the web, or heights have another unit: "
+            f"{PROJECT}"
+        )
     if request.trajectory is not None:
         return _from_file(reader, vectors, pairs, request, scan.packets > 1)
     found = estimate_path(vectors, "direction vectors", pairs)
@@ -297,8 +313,9 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
 
 def refuse_units(reader: StripReader, scan: StripScan) -> None:
     """Raise InputError where the coordinates are not in metres, or where the packets make that doubtful."""
-    path, units, ratio = reader.facts.path, reader.facts.units, scan.vectors.ratio
-    remedy = "project the strip to metres, or leave out the stages that measure in metres"
+    path, units, ratio, remedy = reader.facts.path, reader.facts.units, scan.vectors.ratio, PROJECT
+    if doubt := _doubt_map(reader):
+        raise InputError(f"{path}: {doubt}: {remedy}")
     for unit in units:
         if not unit.is_metric:
             why = "which have no height" if unit.kind == "geocentric" else "so ranges would not be in metres"
@@ -318,6 +335,33 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
             f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
             f"coordinates are in feet, packet vectors in metres, and no CRS says so: {remedy}"
         )
+
+
+def _doubt_map(reader: StripReader) -> str:
+    """What is wrong with the metres of a map by its CRS; empty where nothing is."""
+    header = reader.facts.header
+    scale = float(np.cosh(np.clip(0.5 * (header.mins[1] + header.maxs[1]) / EARTH, -9.0, 9.0)))
+    if scale < 1.0 + STRETCHED or not MERCATOR.search(reader.facts.crs or ""):
+        return ""
+    return f"coordinates are of a Mercator projection, whose metres are {scale:.2f} times as long here as on the ground"
+
+
+def _measure_stretch(vectors: np.ndarray) -> float:
+    """How much longer vectors (n, 3) are across than upwards; 0 where that is 1 within STRETCHED, or not known.
+
+    Light is as fast in all directions, so that the square across falls by 1 where that upwards grows by 1.
+    """
+    if not len(vectors):
+        return 0.0
+    up, across = vectors[:, 2] ** 2, vectors[:, 0] ** 2 + vectors[:, 1] ** 2
+    off = up - np.mean(up)
+    square = float(off @ off)
+    slope = float(off @ across) / max(square, 1e-300)
+    left = across - np.mean(across) - slope * off
+    # Vectors that are longer and shorter for another reason show nothing.
+    exact = float(left @ left) < OFF_LINE * slope**2 * square and square > OFF_LINE**3 * float(up @ up)
+    stretch = max(-slope, 0.0) ** 0.5
+    return stretch if exact and stretch and abs(stretch - 1.0) > STRETCHED else 0.0
 
 
 def _look_like_degrees(reader: StripReader) -> bool:
