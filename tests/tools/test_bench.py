@@ -157,13 +157,14 @@ def test_plot_is_written_where_matplotlib_is(tmp_path, document):
     assert (tmp_path / "bench-flat.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_scene_is_shaped_like_the_strip(tmp_path):
-    recording = Recording(noise_std=1.6, baseline=30.0, bits=16, n_samples=64)
+@pytest.mark.parametrize("rho", [0.0, 0.667])
+def test_scene_is_shaped_like_the_strip(tmp_path, rho):
+    recording = Recording(noise_std=1.6, rho=rho, baseline=30.0, bits=16, n_samples=64)
     scene = replace(find_scene("open"), recording=recording)
     simulate_strip(scene, tmp_path / "a.las", pulses=3000, seed=1)
     like = command.shape_scene(tmp_path / "a.las", load_profile("accurate"))
     shaped = like.recording
-    assert (shaped.bits, shaped.n_samples, shaped.rho) == (16, 64, 0.0)
+    assert (shaped.bits, shaped.n_samples) == (16, 64) and shaped.rho == pytest.approx(rho, abs=0.001)
     assert shaped.noise_std == pytest.approx(1.6, rel=0.05) and shaped.baseline == pytest.approx(30, abs=0.1)
     assert shaped.pulse.sigma == pytest.approx(2.0, rel=0.08)
     _, truth = simulate_block(scene, 4000, np.random.default_rng(1))

@@ -300,15 +300,11 @@ def shape_scene(strip: Path, chain: Chain) -> StripScene:
         )
     block = pool_blocks(chosen)
     system = survey_blocks([block]).system
-    # The receiver that the survey found: levels, noise and its colour, clipping, learned pulse.
-    stds = system.noise.by_kind
-    pairs = [(stds.get(f"{kind}_smoothed", 0.0), stds.get(kind, 0.0)) for kind in ("tail", "quiet")]
-    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
-    # The binomial filter whose noise changes by smoothing as the noise of the strip does.
-    color = int(np.argmin(np.abs(np.sqrt(accuracy.smoothed_power(np.arange(5)) / 6) - ratio)))
-    # Noise of one sample; `noise.std` is what coloured noise does to the amplitude of a pulse.
-    noise = stds.get("outside") or stds.get("quiet") or system.noise.std
-    gain = np.sqrt(accuracy.smoothed_power(color) / 6)
+    # The receiver that the survey found: levels, noise and its colour, clipping, learned pulse. The noise is that of one
+    # sample: `noise.std` is what coloured noise does to the amplitude of a pulse.
+    # The binomial filter whose noise changes by [1 2 1] as the noise of the strip does.
+    first, second = (*system.noise.correlation, 0.0, 0.0)[:2]
+    color = int(np.argmin(np.abs(accuracy.smoothed_power(np.arange(5)) - (6 + 8 * first + 2 * second))))
     pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
     if len(system.components) > 1:
         weight, delay, sigma = system.components[0]
@@ -320,7 +316,7 @@ def shape_scene(strip: Path, chain: Chain) -> StripScene:
         bits=block.digitizer.bits,
         baseline=system.noise.baseline,
         baseline_spread=system.noise.baseline_spread,
-        noise_std=float(np.sqrt(max(noise**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
+        noise_std=float(np.sqrt(max(system.noise.quiet**2 - QUANTISATION_STD**2, 0.0))),
         rho=color / (color + 1),
         noise_gain=system.noise.gain,
         saturation=clip,
