@@ -130,23 +130,6 @@ def measure_recovery(signal, noise, reach, limit):
     return s // step * step + step
 
 
-def residual_noise(residual, used, lost, lags):
-    """Standard deviation and correlation of limited residuals about their common mean."""
-    values = residual[used].astype(float)
-    low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
-    wide = 7 * max(0.5 * (high - low), QUANTISATION_STD)
-    spread = np.sqrt(np.mean([min(max(v - middle, -wide), wide) ** 2 for v in values]))
-    limit = 3.5 * max(spread, QUANTISATION_STD)
-    kept = np.clip(residual.astype(float) - middle, -limit, limit)
-    kept -= kept[used].mean()
-    covariance = []
-    for lag in range(lags + 1):
-        first, second = slice(0, kept.shape[1] - lag), slice(lag, None)
-        products = (kept[:, first] * kept[:, second])[used[:, first] & used[:, second]]
-        covariance.append(np.mean(products) + (lost[lag] if lag < len(lost) else 0.0))
-    return np.sqrt(covariance[0]), np.array(covariance[1:]) / covariance[0]
-
-
 def colour_factors(correlation, *columns):
     """Errors of a white-weighted fit in coloured noise over those in white noise: by the covariance of its result."""
     size = len(columns[0])

@@ -26,7 +26,6 @@ from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.kernels.signal import noise as noise_kernels
 from wavebatch.kernels.signal.deconvolve import correlate_pulse, deconvolve_wiener, fit_height, wiener_taps
 from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
-from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelation, gaussian_taps
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 from wavebatch.kernels.signal.runs import find_stretches, lobe_edges
 from wavebatch.kernels.signal.signal import NARROW, accumulate, sum_samples, widen_after
@@ -197,12 +196,6 @@ def test_correlations_are_those_of_pairs(rng):
         expected = naive_signal.measure_covariance(slow[:, :columns], twice[:, :columns], 12)
         assert found == pytest.approx(expected, rel=1e-4, abs=1e-3)
     assert noise_kernels.measure_covariance(signal, quiet & False) is None
-    residual, used = np.tile(signal.T - 12, (3, 1)), np.tile(quiet.T, (3, 1))
-    residual = residual + 30 * (rng.random(residual.shape) < 0.01)  # echoes that nobody fitted
-    std, correlation = noise_kernels.residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), lags=5)
-    expected = naive_signal.residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), 5)
-    assert std == pytest.approx(expected[0], rel=1e-5) and correlation == pytest.approx(expected[1], abs=1e-5)
-    assert noise_kernels.residual_noise(residual.astype(np.float32), used & False, np.zeros(0)) is None
 
 
 def test_the_longest_recording_is_kept():
@@ -271,14 +264,6 @@ def test_a_whitening_filter_is_the_inverse_cholesky_factor_of_its_noise(correlat
 @pytest.mark.parametrize("correlation", [(1.0, 1.0), (0.8, 0.1), (0.5, 1.0), (-0.9, 0.5)])
 def test_what_no_noise_has_is_not_predicted(correlation):
     assert noise_kernels.predict_noise(correlation) is None
-
-
-@pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4)])
-def test_the_autocorrelation_of_a_filter_is_that_of_its_shifted_taps(taps):
-    whole = np.r_[taps[:0:-1], taps]
-    k = len(whole)
-    expected = [sum(whole[i] * whole[i + lag] for i in range(k - lag)) for lag in range(k)]
-    assert filter_autocorrelation(taps) == pytest.approx(np.array(expected) / expected[0])
 
 
 def test_wiener_is_the_linear_estimate_of_least_error(rng):

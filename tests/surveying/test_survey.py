@@ -135,6 +135,18 @@ def test_any_waveforms_can_be_surveyed(rng):
         assert choose_chain(survey).steps
 
 
+def test_noise_of_packets_that_begin_and_end_in_echoes_is_a_guess(rng):
+    """Nothing is quiet there: the quietest edges give a noise that is too large, and that is said."""
+    place, sigma = np.arange(143), 7.0
+    centre = np.stack([rng.uniform(0, sigma, 44) - sigma / 2, 143 - rng.uniform(0, sigma, 44) + sigma / 2], axis=1)
+    height = np.exp(rng.uniform(2, 5.5, centre.shape))
+    signal = np.sum(height[..., None] * np.exp(-0.5 * ((place - centre[..., None]) / sigma) ** 2), axis=1)
+    counts = np.rint(20 + signal + rng.normal(0, 1, signal.shape)).clip(0)
+    survey = survey_block(WaveformBlock.from_samples(counts.astype(np.uint16)))
+    assert survey.system.noise.by_kind["quiet"] == 0 and 1 < survey.system.noise.std < 5
+    assert "noise is a guess" in next(doubt_survey(survey.system, survey.figures, 44)).text
+
+
 def test_riegl_is_what_is_known_of_it(riegl):
     """R1, R3 and R4 of docs/algorithms.md 8: s_ref 1.86 ns, +4 % after-pulse at +10.5 ns; noise of a pulse 1.7 DN."""
     survey = survey_file(riegl)

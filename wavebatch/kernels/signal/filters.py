@@ -51,13 +51,6 @@ def filter_energy(taps: np.ndarray) -> float:
     return float(taps[0] ** 2 + 2 * np.sum(taps[1:] ** 2))
 
 
-def filter_autocorrelation(taps: np.ndarray) -> np.ndarray:
-    """Correlation (2 k - 1,) at lags 0, 1, ... of white noise behind a symmetric filter given by its half (k,)."""
-    whole = np.concatenate([taps[:0:-1], taps])
-    products = np.correlate(whole, whole, "full")[len(whole) - 1 :]
-    return products / products[0]
-
-
 def filter_symmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
     """Signal correlated with a symmetric filter.
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.order import known_median, median, quantile, quantiles
+from wavebatch.core.order import known_median, median, quantile
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, log, solve
 from wavebatch.kernels.library import CQuiet, call
@@ -76,11 +76,8 @@ LAGS, MOST_LAGS, RISE = (12, 20), 48, 4
 """Lags of the noise's covariance that are measured, for narrow and for wide pulses: each adds its error to the noise of
 a pulse. Up to MOST_LAGS follow while the variogram is higher at each of the last RISE lags than at those before."""
 
-CLIPPED = 3.5
-"""Robust standard deviations at which residuals are cut off."""
-
 LEAST_PAIRS = 2000
-"""Pairs of residuals from which a correlation is measured, or of quiet samples from which its shape is."""
+"""Pairs of quiet samples from which the shape of their correlation is measured."""
 
 LEAST_QUIET_PAIRS = 100
 """Pairs of quiet neighbours from which a covariance is measured: their variance is then known to a seventh."""
@@ -643,56 +640,6 @@ def keep_longest(missing: np.ndarray) -> np.ndarray:
     n, most = missing.shape[1], int(number.max(initial=1))
     sizes = np.bincount((number * n + np.arange(n))[recorded], minlength=(most + 1) * n).reshape(most + 1, n)
     return number != np.argmax(sizes[1:], axis=0) + 1
-
-
-def residual_noise(
-    residual: np.ndarray, used: np.ndarray, lost: np.ndarray, lags: int = LAGS[0]
-) -> tuple[float, np.ndarray] | None:
-    """Standard deviation and correlation of what fits leave outside of their echoes.
-
-    Parameters
-    ----------
-    residual : float32 (n, s)
-        Waveforms less baseline and echoes [count].
-    used : bool (n, s)
-        Samples that count.
-    lost : float (k,)
-        Covariance at lags 0, 1, ... that the choice of these waveforms has taken away [count^2]; 0 beyond.
-    lags : int
-        Largest lag [samples].
-
-    Returns
-    -------
-    (std, correlation (k,)) or None
-        None where fewer than LEAST_PAIRS samples count.
-
-    Notes
-    -----
-    Values are limited to CLIPPED robust standard deviations, so that weak echoes without a fit do not count as noise.
-    No mean of a waveform is taken off: what its baseline is wrong by is noise to its amplitudes.
-    """
-    values = residual[used]
-    if len(values) < LEAST_PAIRS:
-        return None
-    low, middle, high = quantiles(values, [0.1587, 0.5, 0.8413])
-    # Quantiles of whole counts may give half of the spread, so that it is found in two steps.
-    wide = 2 * CLIPPED * max(0.5 * (high - low), QUANTISATION_STD)
-    spread = np.sqrt(np.mean(np.clip(values - np.float32(middle), -wide, wide) ** 2, dtype=np.float64))
-    limit = CLIPPED * max(float(spread), QUANTISATION_STD)
-    deviation = np.where(used, np.clip(residual - np.float32(middle), -limit, limit), np.float32(0))
-    # The median of whole counts is one of them; taken for the mean it would make all samples seem correlated.
-    deviation -= used * np.float32(np.sum(deviation, dtype=np.float64) / len(values))
-    variance = np.sum(deviation * deviation, dtype=np.float64) / len(values)
-    found = []
-    for lag in range(1, min(lags, residual.shape[1] - 1) + 1):
-        pairs = np.count_nonzero(used[:, lag:] & used[:, :-lag])
-        if pairs < LEAST_PAIRS:
-            break
-        found.append(np.einsum("ns,ns->", deviation[:, lag:], deviation[:, :-lag], dtype=np.float64) / pairs)
-    covariance = np.array([variance, *found])
-    common = min(len(covariance), len(lost))
-    covariance[:common] += lost[:common]
-    return float(np.sqrt(covariance[0])), covariance[1:] / max(covariance[0], 1e-12)
 
 
 LEAST_FACTOR = 0.05

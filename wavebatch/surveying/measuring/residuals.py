@@ -1,7 +1,4 @@
-"""What fits leave of a sample: noise outside of the echoes, its correlation, and its growth with the signal.
-
-The survey takes its noise from here once it has a pulse (docs/algorithms.md R3, H10 to H12).
-"""
+"""What fits leave of a sample: noise under weak echoes, and its growth with the signal (docs/algorithms.md R3, H12)."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, Waveform
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import render_pulses
 from wavebatch.kernels.fit.pulse_shape import PulseShape
-from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
-from wavebatch.kernels.signal.noise import DRIFT, MOST_LEAST, floor_share, residual_noise
+from wavebatch.kernels.signal.filters import filter_symmetric
+from wavebatch.kernels.signal.noise import DRIFT, MOST_LEAST, floor_share
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import matched_filter
@@ -30,18 +27,6 @@ from wavebatch.surveying.measuring.noise_and_width import DITHERED, ENOUGH_TO_LE
 
 WEAK = 60.0
 """Amplitude, over DITHERED, up to which the misfit of a learned pulse is less than rounding."""
-
-LEAST_WINDOW = 6
-"""Samples outside of echoes from which a waveform counts for the noise."""
-
-CALM = 0.6
-"""Share of the waveforms, those with the least power in the pulse's filter, that the noise's correlation comes from."""
-
-OUTSIDE_REACH = 3.0
-"""Widths of an echo around it that are its own, not noise."""
-
-SAME_NOISE = 1.1
-"""Ratio of the noise of quiet samples and of residuals up to which they are the same noise."""
 
 GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
 """Widths of an echo around it in which the growth of noise is looked for, steps of the lag there, and the echoes of a
@@ -162,7 +147,7 @@ def describe_own(system: SystemPulse, echoes: EchoTable, spacing: float) -> tupl
 
 
 def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
-    """The system with the noise that fits leave outside of their echoes, and its growth with the signal.
+    """The system with the noise that fits leave in weak echoes, where counts hardly scatter, and its growth.
 
     Parameters
     ----------
@@ -173,14 +158,10 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
 
     Notes
     -----
-    Samples outside of all echoes decide, once the pulse with its tail is taken off: many strips have no other quiet
-    ones, and what the digitizer does after an echo is noise to a weak echo there. Residuals in the core of echoes also
-    hold the pulse's misfit, which is none: they decide only where quiet samples never leave one count
-    (docs/algorithms.md R3, H10, H12).
+    Residuals in the core of echoes also hold the pulse's misfit, which is no noise: they decide only where quiet
+    samples never leave one count (docs/algorithms.md R3, H10, H12).
     """
     n, s = block.samples.shape
-    if not system.noise.by_kind["quiet"]:
-        system = _measure_outside(block, system, echoes)
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
     alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise.std))
     if system.noise.gain and len(alone):  # what a fit takes away is known for one without weights
@@ -201,10 +182,10 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     kinds["core"] = _robust_std(residual[np.abs(lag) < 2.5])
     std = system.noise.std
     weak = alone.amplitude < WEAK * DITHERED
-    if kinds.get("outside", kinds["quiet"]) < UNDITHERED and np.count_nonzero(weak) >= ENOUGH_TO_LEARN:
+    if kinds["quiet"] < UNDITHERED and np.count_nonzero(weak) >= ENOUGH_TO_LEARN:
         kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
         std = max(std, kinds["weak_echoes"])
-    sample = kinds.get("outside") or kinds["quiet"] or std
+    sample = kinds["quiet"] or std
     coloured = std > COLOURED * sample
     steep = bool(2 * system.noise.gain * quantile(alone.amplitude, 0.9) > MANIFOLD * std**2) and not coloured
     gain = _noise_gain(residual, model, lag, width, std, coloured, steep=steep)
@@ -233,74 +214,6 @@ def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     std = noise.quiet * np.sqrt(left)
     gain = _noise_gain(fine, signal, lag, np.full(len(rows), np.inf), std, False, steep=True) * (noise.std / std) ** 2
     return gain if gain * quantile(echoes.amplitude, 0.9) > MANIFOLD * noise.std**2 else 0.0
-
-
-def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
-    """The system with noise and correlation of what is left outside of all clear echoes.
-
-    Weak echoes are neither taken off nor left out: a threshold that was too low would find them in the noise and make
-    it smaller still. What real ones add is cut off.
-    """
-    strongest = np.zeros(len(block))
-    np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
-    clear = (echoes.amplitude > 8 * system.noise.std) & (echoes.amplitude > 0.05 * strongest[echoes.waveform])
-    clear = echoes.take(np.flatnonzero(clear))
-    residual = subtract_echoes(block, system, clear)
-    used = np.isfinite(residual)
-    used &= ~_cover(block, clear)
-    ref = system.sigma_ref / block.spacing
-    seen, calm, lost = _pulse_noise(residual, used, ref)
-    found = residual_noise(residual[calm], used[calm], lost)
-    if found is None or not seen:
-        return system
-    std, correlation = found[0], tuple(found[1].tolist())
-    hidden = DITHERED if std < UNDITHERED else QUANTISATION_STD
-    kinds = {**system.noise.by_kind, "outside": std, "outside_pulse": seen}
-    # The residual is a few percent too small, because the baseline comes from the same samples. The estimate from quiet
-    # samples is corrected for that: it is the floor, unless they hold tails of echoes, which the residual does not.
-    floor = kinds["quiet_pulse"] if 0 < kinds["quiet"] < SAME_NOISE * std else 0.0
-    std = float(max(seen, std, hidden, floor))
-    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, correlation=correlation))
-
-
-def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-    """Samples within OUTSIDE_REACH widths of an echo, bool (n, s)."""
-    n, s = block.samples.shape
-    reach = OUTSIDE_REACH * echoes.sigma / block.spacing
-    first = np.clip(np.ceil(echoes.time / block.spacing - reach), 0, s).astype(np.int64)
-    last = np.clip(np.floor(echoes.time / block.spacing + reach) + 1, 0, s).astype(np.int64)
-    steps = np.zeros((n, s + 1), np.int32)
-    np.add.at(steps, (echoes.waveform, first), 1)
-    np.add.at(steps, (echoes.waveform, last), -1)
-    return np.cumsum(steps[:, :-1], axis=1) > 0
-
-
-def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Noise of a pulse's amplitude, as that of a sample of white noise, and the calm half of the waveforms (k,).
-
-    The median over the waveforms of the power that a matched filter finds in them: echoes too weak to be fitted raise
-    it in some of them only. 0 where too few have enough samples.
-
-    Third: the covariance at lags 0, 1, ... that the noise of the calm half lacks. By chance, too, they have less power
-    in the filter than others; what lacks has the shape of the filter's own correlation.
-    """
-    taps = gaussian_taps(width)
-    weight = used.T.astype(np.float32)
-    left = filter_symmetric(np.where(used, residual, 0).T.astype(np.float32), taps)
-    energy = filter_symmetric(weight, taps * taps)
-    whole = (energy > 0.8 * filter_energy(taps)) & used.T
-    number = whole.sum(axis=0)
-    rows = np.flatnonzero(number >= LEAST_WINDOW)
-    if len(rows) < FEW:
-        return 0.0, rows, np.zeros(0)
-    power = np.where(whole, left * left / np.maximum(energy, 1e-6), 0).sum(axis=0)[rows] / number[rows]
-    # Median of chi2 with k degrees of freedom, over k; not fewer than 4, since what drifts is alike in all waveforms.
-    freedom = np.maximum(median(number[rows]) / (2.5 * width + 1), 4.0)
-    typical = float(median(power) / (1 - 2 / (9 * freedom)) ** 3)
-    calm = power <= quantile(power, CALM)
-    shape = filter_autocorrelation(taps)
-    lack = max(typical - float(power[calm].mean()), 0.0) / (2 * np.sum(shape * shape) - 1)
-    return float(np.sqrt(typical)), rows[calm], lack * shape
 
 
 def _robust_std(values: np.ndarray) -> float:

@@ -300,7 +300,7 @@ def shape_scene(strip: Path, chain: Chain) -> StripScene:
         )
     block = pool_blocks(chosen)
     system = survey_blocks([block]).system
-    # The receiver that the survey found: levels, noise and its colour, clipping, learned pulse. The noise is that of one
+    # The receiver that the survey found: levels, noise and its colour, clipping, learned pulse. The noise is that of a
     # sample: `noise.std` is what coloured noise does to the amplitude of a pulse.
     # The binomial filter whose noise changes by [1 2 1] as the noise of the strip does.
     first, second = (*system.noise.correlation, 0.0, 0.0)[:2]
