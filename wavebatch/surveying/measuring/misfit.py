@@ -13,6 +13,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.order import distinct, median, quantile, quantiles
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.learn_pulse import ONSET
@@ -84,6 +85,10 @@ SURELY, REPEATED, OFTEN = 6.0, 5, 2.0
 """Errors of its amplitude by which an echo that has room is found, whatever the noise. Echoes that show a part, at
 least, and over those that would and do not: where one strong echo in ten has a neighbour of the same lag and share, as
 in dense canopies, five do so once in 100,000 such places."""
+
+VARIES = 0.12
+"""Scatter of the logarithms of a part's shares beyond that of noise: a tenth of itself from shot to shot. Targets at one
+distance before or behind all others, as a film or a net, differ by more, and are echoes."""
 
 PLACES = 3
 """Tenths of the strip in which it must be seen: an object with another one behind it lies in one, or in two beside
@@ -387,7 +392,11 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
             chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
             with_it = np.count_nonzero(alike)
             least_number = max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1))
-            if with_it >= least_number and len(distinct(tenth[alike])) >= PLACES:
+            if with_it < least_number or len(distinct(tenth[alike])) < PLACES:
+                continue
+            scatter = MAD_TO_STD * median(np.abs(level[alike] - median(level[alike])))
+            usual = np.hypot(VARIES, median(least[alike] / highest[alike]) / SURELY)
+            if scatter < usual * (1 + SURE * MEDIAN_ERROR / np.sqrt(with_it)):
                 likely.append((with_it - without, alike))
         if likely:
             alike = max(likely, key=lambda one: one[0])[1]
