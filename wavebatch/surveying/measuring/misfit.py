@@ -87,8 +87,8 @@ least, and over those that would and do not: where one strong echo in ten has a 
 in dense canopies, five do so once in 100,000 such places."""
 
 VARIES = 0.12
-"""Scatter of the logarithms of a part's shares beyond that of noise: a tenth of itself from shot to shot. Targets at one
-distance before or behind all others, as a film or a net, differ by more, and are echoes."""
+"""Scatter of the logarithms of a part's shares beyond that of noise: a tenth of itself from shot to shot. Targets at
+one distance before or behind all others, as a film or a net, differ by more, and are echoes."""
 
 PLACES = 3
 """Tenths of the strip in which it must be seen: an object with another one behind it lies in one, or in two beside
@@ -352,7 +352,8 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     Notes
     -----
     Neighbours differ in lag and share from echo to echo. A part of the pulse is found with every echo that is so strong
-    that it must be, unless another echo is in its place (docs/algorithms.md R3).
+    that it must be, unless another echo is in its place (docs/algorithms.md R3). If its share varies, it is no tail
+    either, whatever samples show.
     """
     ref = system.sigma_ref
     found = SURELY * system.noise.std / float(np.sqrt(filter_energy(gaussian_taps(ref / block.spacing))))
@@ -380,7 +381,9 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         np.maximum.at(highest, owner[here], share[here])
         np.maximum.at(beside, owner[near], share[near])
         whole = (low < place - 2) & (high > place + 2)
-        likely, level = [], log(np.maximum(highest, 1e-9))
+        level = log(np.maximum(highest, 1e-9))
+        likely: list[tuple[float, np.ndarray]] = []
+        varying: list[tuple[float, np.ndarray]] = []
         for middle in distinct(np.round(log(share[here[must[here]]]), 1)):
             part = float(exp(middle))
             seen = whole & (least < LESS * part)
@@ -396,15 +399,17 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
                 continue
             scatter = MAD_TO_STD * median(np.abs(level[alike] - median(level[alike])))
             usual = np.hypot(VARIES, median(least[alike] / highest[alike]) / SURELY)
-            if scatter < usual * (1 + SURE * MEDIAN_ERROR / np.sqrt(with_it)):
-                likely.append((with_it - without, alike))
-        if likely:
-            alike = max(likely, key=lambda one: one[0])[1]
+            steady = scatter < usual * (1 + SURE * MEDIAN_ERROR / np.sqrt(with_it))
+            if steady or part > FAINT:
+                (likely if steady else varying).append((with_it - without, alike))
+        if likely or varying:
+            alike = max(likely or varying, key=lambda one: one[0])[1]
             part = quantile(highest[alike], 1 - NORMAL_BELOW[1])  # targets and noise move it
             around = distinct((np.rint(lag[here[alike[owner[here]]]])[:, None] + (-1, 0, 1)).ravel())
             for at in around[np.abs(around) >= 3]:
-                profile[at * ref] = max(profile.get(at * ref, 0.0), part)
-    return replace(system, tail_misfit=tuple(sorted((float(lag), float(share)) for lag, share in profile.items())))
+                profile[at * ref] = max(profile.get(at * ref, 0.0), part) if likely else 0.0
+    parts = ((float(lag), float(share)) for lag, share in profile.items() if share)
+    return replace(system, tail_misfit=tuple(sorted(parts)))
 
 
 class Seen(NamedTuple):
