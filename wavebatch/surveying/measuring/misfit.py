@@ -401,7 +401,7 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
             usual = np.hypot(VARIES, median(least[alike] / highest[alike]) / SURELY)
             steady = scatter < usual * (1 + SURE * MEDIAN_ERROR / np.sqrt(with_it))
             if steady or part > FAINT:
-                (likely if steady else varying).append((with_it - without, alike))
+                (likely if steady else varying).append((float(with_it - without), alike))
         if likely or varying:
             alike = max(likely or varying, key=lambda one: one[0])[1]
             part = quantile(highest[alike], 1 - NORMAL_BELOW[1])  # targets and noise move it
