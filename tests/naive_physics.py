@@ -112,10 +112,12 @@ def energy_slope(light, energy):
 
 
 def judge_energies(light, energy):
-    """"" where light follows the energies or nothing is known; else "early", "late" or "others"."""
+    """"" where light follows the energies or nothing is known, else "early", "late" or "others"; and what it lacks."""
     slope, error = energy_slope(light, energy)
-    if error > 0.15 or slope + 3 * error > 0.5:
-        return ""
+    if error > 0.15:
+        return "", 0.0
+    if slope + 3 * error > 0.5:
+        return "", max(0.95 - slope, 0.0)
     if energy_slope(light, [energy[-1], *energy[:-1]])[0] > 0.5:
-        return "early"
-    return "late" if energy_slope(light, [*energy[1:], energy[0]])[0] > 0.5 else "others"
+        return "early", 1.0
+    return "late" if energy_slope(light, [*energy[1:], energy[0]])[0] > 0.5 else "others", 1.0

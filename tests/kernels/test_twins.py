@@ -505,8 +505,9 @@ def test_energies_are_judged_as_by_a_loop(rng):
         given = [energy, np.roll(energy, 1), np.roll(energy, -1), rng.permutation(energy), np.ones(200)][turn % 5]
         given = np.where(rng.random(200) < 0.05, np.nan, given)
         with np.errstate(invalid="ignore"):
-            found = judge_energies(light, given)
-        expected = naive_physics.judge_energies(light.tolist(), given.tolist())
+            found, lacks = judge_energies(light, given)
+        expected, less = naive_physics.judge_energies(light.tolist(), given.tolist())
+        assert lacks == pytest.approx(less, abs=1e-9)
         assert {"": "", "early": "too early", "late": "too late", "others": "other pulses"}[expected] in found
         assert bool(found) == bool(expected)
         seen.add(expected)

@@ -944,11 +944,12 @@ def test_energies_of_other_pulses_are_noticed(rng, scatter):
     ground = np.where(np.arange(4000) // 40 % 2, 0.1, 0.5)
     energy = 1 + scatter * rng.standard_normal(4000)
     light = ground * energy * (1 + 0.02 * rng.standard_normal(4000))
-    assert judge_energies(light, 7.5 * energy) == ""
-    assert "one pulse too late" in judge_energies(light, np.roll(energy, 1))
-    assert "one pulse too early" in judge_energies(light, np.roll(energy, -1))
-    assert "they are of other pulses" in judge_energies(light, rng.permutation(energy))
-    assert judge_energies(light, np.ones(4000)) == judge_energies(light, np.full(4000, np.nan)) == ""
+    doubt, noise = judge_energies(light, 7.5 * energy)
+    assert doubt == "" and noise < 0.05
+    assert "one pulse too late" in judge_energies(light, np.roll(energy, 1))[0]
+    assert "one pulse too early" in judge_energies(light, np.roll(energy, -1))[0]
+    assert "they are of other pulses" in judge_energies(light, rng.permutation(energy))[0]
+    assert judge_energies(light, np.ones(4000)) == judge_energies(light, np.full(4000, np.nan)) == ("", 0.0)
 
 
 def test_a_shuffled_log_of_energies_is_refused(tmp_path, rng):

@@ -314,8 +314,13 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
 def refuse_units(reader: StripReader, scan: StripScan) -> None:
     """Raise InputError where the coordinates are not in metres, or where the packets make that doubtful."""
     path, units, ratio, remedy = reader.facts.path, reader.facts.units, scan.vectors.ratio, PROJECT
-    if doubt := _doubt_map(reader):
-        raise InputError(f"{path}: {doubt}: {remedy}")
+    low, high = (ends[1] for ends in (reader.facts.header.mins, reader.facts.header.maxs))
+    scale = float(np.cosh(np.clip(0.5 * (low + high) / EARTH, -9.0, 9.0)))
+    if scale > 1.0 + STRETCHED and MERCATOR.search(reader.facts.crs or ""):
+        raise InputError(
+            f"{path}: coordinates are of a Mercator projection, whose metres are {scale:.2f} times as long here as on "
+            f"the ground: {remedy}"
+        )
     for unit in units:
         if not unit.is_metric:
             why = "which have no height" if unit.kind == "geocentric" else "so ranges would not be in metres"
@@ -335,15 +340,6 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
             f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
             f"coordinates are in feet, packet vectors in metres, and no CRS says so: {remedy}"
         )
-
-
-def _doubt_map(reader: StripReader) -> str:
-    """What is wrong with the metres of a map by its CRS; empty where nothing is."""
-    header = reader.facts.header
-    scale = float(np.cosh(np.clip(0.5 * (header.mins[1] + header.maxs[1]) / EARTH, -9.0, 9.0)))
-    if scale < 1.0 + STRETCHED or not MERCATOR.search(reader.facts.crs or ""):
-        return ""
-    return f"coordinates are of a Mercator projection, whose metres are {scale:.2f} times as long here as on the ground"
 
 
 def _measure_stretch(vectors: np.ndarray) -> float:

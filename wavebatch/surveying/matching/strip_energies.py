@@ -122,9 +122,9 @@ def take_energies(
         unit = reader.read_unit(reader.unit_count() // 2, scan)
         rows = np.flatnonzero(unit.packets.owned)[:NEIGHBOURS]
         pulses = _join(reader, unit, rows[np.cumsum(unit.packets.n_samples[rows]) <= MOST_SAMPLES], energy)
-    growth = 0.0
+    growth = noise = 0.0
     if energy is not None and request is not None:
-        doubt = judge_energies(pulses[1], pulses[2])
+        doubt, noise = judge_energies(pulses[1], pulses[2])
         if doubt:
             raise InputError(
                 f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
@@ -182,7 +182,9 @@ def take_energies(
             f"gains without a mark: the error of the constant grows by {100 * apart * 0.5**0.5:.0f} %; give --energy"
         )
         growth = math.hypot(growth, apart * 0.5**0.5)
-    lacks = 0.0
+    # An error of the log from shot to shot that was not in the calibration's.
+    measured = max((row.shot_energy for row in calibration.channels), default=0.0) if calibration else 0.0
+    noise, lacks = math.sqrt(max(noise * energy.shots**2 - measured**2, 0.0)) if energy else 0.0, 0.0
     if calibration is not None:
         known = calibration.energy_mean
         if energy is not None and known is not None:
@@ -199,7 +201,7 @@ def take_energies(
         notes += [note] if note else []
     if energy is None:
         return StripEnergies(None, lacks, growth, tuple(notes))
-    return StripEnergies(replace(energy, missed=lacks), 0.0, growth, tuple(notes))
+    return StripEnergies(replace(energy, missed=math.hypot(lacks, noise)), 0.0, growth, tuple(notes))
 
 
 def _find_following(pulses: np.ndarray) -> float:
