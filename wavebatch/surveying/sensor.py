@@ -315,10 +315,10 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
     """Raise InputError where the coordinates are not in metres, or where the packets make that doubtful."""
     path, units, ratio, remedy = reader.facts.path, reader.facts.units, scan.vectors.ratio, PROJECT
     low, high = (ends[1] for ends in (reader.facts.header.mins, reader.facts.header.maxs))
-    scale = float(np.cosh(np.clip(0.5 * (low + high) / EARTH, -9.0, 9.0)))
-    if scale > 1.0 + STRETCHED and MERCATOR.search(reader.facts.crs or ""):
+    map_scale = float(np.cosh(np.clip(0.5 * (low + high) / EARTH, -9.0, 9.0)))
+    if map_scale > 1.0 + STRETCHED and MERCATOR.search(reader.facts.crs or ""):
         raise InputError(
-            f"{path}: coordinates are of a Mercator projection, whose metres are {scale:.2f} times as long here as on "
+            f"{path}: coordinates are of a Mercator projection, whose metres are {map_scale:.2f} times as long here as on "
             f"the ground: {remedy}"
         )
     for unit in units:
