@@ -318,8 +318,8 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
     map_scale = float(np.cosh(np.clip(0.5 * (low + high) / EARTH, -9.0, 9.0)))
     if map_scale > 1.0 + STRETCHED and MERCATOR.search(reader.facts.crs or ""):
         raise InputError(
-            f"{path}: coordinates are of a Mercator projection, whose metres are {map_scale:.2f} times as long here as on "
-            f"the ground: {remedy}"
+            f"{path}: coordinates are of a Mercator projection, whose metres are {map_scale:.2f} times as long here as "
+            f"on the ground: {remedy}"
         )
     for unit in units:
         if not unit.is_metric:
