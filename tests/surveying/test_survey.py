@@ -107,6 +107,17 @@ def test_waveforms_of_several_lengths_are_surveyed_together():
     assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
 
 
+def test_copies_of_a_waveform_count_once():
+    """Some files hold a packet's samples for each of its returns. Waveforms without an echo may be alike by chance."""
+    block = make_block("flat", 500, seed=6)[0]
+    copies = block.rows(np.repeat(np.arange(len(block)), 3))
+    (joined,), (one,) = join_digitizers([copies]), join_digitizers([block])
+    rises = np.ptp(block.samples, axis=1) >= 16
+    assert np.array_equal(one.samples, block.samples) and rises.sum() > 400
+    assert len(joined) == len(block) + 2 * (~rises).sum()
+    assert np.array_equal(np.unique(joined.samples, axis=0), np.unique(block.samples, axis=0))
+
+
 @pytest.mark.slow
 @pytest.mark.quick_cases("0.2")
 @pytest.mark.parametrize("gain", [0.0, 0.03, 0.2])

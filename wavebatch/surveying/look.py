@@ -42,6 +42,10 @@ MOST_ECHOES = 200
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
 
+LEAST_RISE = 16
+"""Counts from the lowest to the highest sample of a waveform from which no other one is the same by chance: noise of a
+quarter of a count moves some sample of its flanks."""
+
 LEAST_QUIET_SAMPLES = 4
 """Samples before the strongest echo from which a waveform has a level."""
 
@@ -88,8 +92,19 @@ def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
     for block in blocks:
         if len(block):
             groups.setdefault(block.digitizer.index, []).append(block)
-    joined = [pool_blocks(group) for _, group in sorted(groups.items())]
+    joined = [_drop_copies(pool_blocks(group)) for _, group in sorted(groups.items())]
     return sorted(joined, key=weigh, reverse=True)
+
+
+def _drop_copies(block: WaveformBlock) -> WaveformBlock:
+    """A block without waveforms that are copies of others: some files hold one for each return of a pulse.
+
+    What is seen three times is known no better, but looks as if it were. Flat waveforms may be alike by chance.
+    """
+    rising = np.flatnonzero(np.ptp(block.samples, axis=1) >= LEAST_RISE)
+    rows = np.ascontiguousarray(block.samples[rising])
+    _, first = np.unique(rows.view(f"V{rows.itemsize * rows.shape[1]}")[:, 0], return_index=True)
+    return block if len(first) == len(rows) else block.rows(np.delete(np.arange(len(block)), np.delete(rising, first)))
 
 
 def pool_blocks(group: list[WaveformBlock]) -> WaveformBlock:

@@ -459,13 +459,18 @@ class ResidualShares:
         before = at[row].astype(np.int64)
         part = at[row] - before
         here = (1 - part) * self.share[row, before] + part * self.share[row, before + 1]
-        here = here[np.isfinite(here)]
-        number = len(here)
-        if not number:
-            return Seen(1, 0.0, 0.0, 0.0, 0.0, np.inf)
-        lowest, low, high = quantiles(here, (*NORMAL_BELOW, 1 - NORMAL_BELOW[1]))
-        spread = max(low - lowest, self.noise)
-        return Seen(number, lowest, low + spread, median(here), high, spread)
+        return summarize_shares(here[np.isfinite(here)], self.noise)
+
+
+def summarize_shares(shares: np.ndarray, noise: float) -> Seen:
+    """What echoes leave at one lag, from the lowest of them: neighbours only add; noise: of one share."""
+    number = len(shares)
+    if not number:
+        return Seen(1, 0.0, 0.0, 0.0, 0.0, np.inf)
+    lowest, low, middle, high = quantiles(shares, (*NORMAL_BELOW, 0.5, 1 - NORMAL_BELOW[1]))
+    # Where the lowest quantile is that of a single echo, the next one may be close to it by chance.
+    spread = max(low - lowest if NORMAL_BELOW[0] * number > 1 else (middle - lowest) / 2, noise)
+    return Seen(number, lowest, low + spread, middle, high, spread)
 
 
 def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
