@@ -370,7 +370,7 @@ def test_any_tie_of_returns_to_packets_makes_them_own(rng, location, intensity):
 def test_packets_of_a_stretch_that_are_not_theirs_are_named(strips, tmp_path, scene):
     """A part of a .wdp that was written twice, or without one packet: 14 % of a strip were wrong without a word."""
     strip = swap(strips[scene], strips[scene], tmp_path)
-    assert not scan_of(strip).mixed
+    assert not scan_of(strip).doubts
     content = (tmp_path / "s.wdp").read_bytes()
     with StripReader(strip) as reader, reader.scan() as scan:
         points = reader.read_points(0, scan.points)
@@ -379,7 +379,7 @@ def test_packets_of_a_stretch_that_are_not_theirs_are_named(strips, tmp_path, sc
     moved = content[first + size : last] + content[first : first + size]
     (tmp_path / "s.wdp").write_bytes(content[:first] + moved + content[last:])
     scan = scan_of(strip)
-    (line,) = scan.mixed
+    (line,) = scan.doubts
     low, high = map(int, re.search(r"s\.wdp: packets of points around (\d+) to (\d+) are not theirs", line).groups())
     assert 0.3 * len(points) < low < 0.5 * len(points) and 0.6 * len(points) < high < 0.8 * len(points)
     assert not scan.stranger and line in scan.warnings
@@ -407,7 +407,7 @@ def test_stretches_apart_are_named_one_by_one(strips, tmp_path):
         first, last = (int(points["wavepacket_offset"][int(part * len(points))]) for part in (share, share + 0.25))
         content[first:last] = content[first + 5 * size : last] + content[first : first + 5 * size]
     (tmp_path / "s.wdp").write_bytes(content)
-    (line,) = scan_of(strip).mixed
+    (line,) = scan_of(strip).doubts
     low, high, again, end = (int(found) / len(points) for found in re.search(
         r"around (\d+) to (\d+), (\d+) to (\d+) are not theirs", line).groups())  # fmt: skip
     assert 0.05 < low < 0.2 < high < 0.4 and 0.55 < again < 0.7 < end < 0.9

@@ -1,13 +1,16 @@
 """`info` and `check`: what they say of good strips, bad strips and chain files, and their exit codes."""
 
 import json
+import struct
 
 import numpy as np
+import pytest
 from commands import run_command as run
 from commands import succeed
 from strips import descriptor, make_raw
 from writer_tools import data_file
 
+from wavebatch.files.las.header import read_header
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.file_facts import describe_file
 
@@ -115,6 +118,61 @@ def test_descriptors_of_unlike_gains_are_named(tmp_path):
         assert done.exit_code == 0 and ("amplitudes and energies are in counts of each" in done.stderr) == named
         done = run("voxelize", path, "--size", 1, "-o", tmp_path / "v.npz", "--overwrite")
         assert done.exit_code == 0 and ("amplitudes and energies are in counts of each" in done.stderr) == named
+
+
+def _swap_axes(points):
+    points["X"], points["Y"] = points["Y"].copy(), points["X"].copy()
+
+
+def _lift(points):
+    points["Z"] += 300_000
+
+
+@pytest.mark.parametrize("change", [_swap_axes, _lift])
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_points_far_outside_the_bounds_of_the_header_are_named(tmp_path, tiny_strip, edit_points, change, share):
+    """A stretch with swapped axes, or 300 m too high, was decomposed without a word."""
+
+    def change_some(points):
+        some = points[: int(share * len(points))].copy()
+        change(some)
+        points[: len(some)] = some
+
+    path, out = edit_points(tiny_strip, tmp_path / "a.las", change_some), tmp_path / "out"
+    done = run("run", path, "-o", out, "--profile", "fast", "--quiet")
+    assert f"warning: {int(share * read_header(path).point_count)} points outside the bounds that the" in done.stderr
+    assert "units" in [one["code"] for one in json.loads((out / "a.report.json").read_text())["warnings"]]
+    assert run("check", path).exit_code == 1
+    for command, target in (("export", "b.las"), ("slice", "a.csv"), ("voxelize", "a.npz")):
+        more = ("--size", 50) if command == "voxelize" else ()
+        assert "outside the bounds" in run(command, path, "-o", tmp_path / target, *more).stderr, command
+
+
+def test_bounds_that_are_off_by_little_or_in_another_unit_are_no_damage(tmp_path, tiny_strip):
+    """Rounded to metres, of heights above another datum, missing, or Leica's: the stored integers."""
+    header = read_header(tiny_strip)
+    shift = np.array([0.9, 0.0, 0.9 * (header.maxs[2] - header.mins[2])])
+    stored = [(np.array(ends) - header.offsets) / header.scales for ends in (header.mins, header.maxs)]
+    for number, (low, high) in enumerate([(header.mins + shift, header.maxs + shift), (np.zeros(3), np.zeros(3)),
+                                          (1000 * stored[0], 1000 * stored[1])]):  # fmt: skip
+        content = bytearray(tiny_strip.read_bytes())
+        content[179:227] = struct.pack("<6d", *np.column_stack([high, low]).ravel())
+        path = tmp_path / f"{number}.las"
+        path.write_bytes(content)
+        assert read_header(path).mins == tuple(low)
+        assert "outside the bounds" not in run("run", path, "-o", tmp_path, "--profile", "fast").stderr, number
+
+
+def test_packets_longer_than_their_descriptor_are_named(tmp_path):
+    """Half of every waveform was passed over in silence; words that are filled up are no samples."""
+    for stated, bytes_more, named in ((16, 0, True), (32, 0, False), (32, 7, False), (32, 8, True)):
+        raw = make_raw(n_samples=32)
+        raw.vlrs = [descriptor(1, samples=stated)]
+        raw.points["wavepacket_size"] += bytes_more
+        path = raw.write(tmp_path / f"{stated}-{bytes_more}.las")
+        done = run("run", path, "-o", tmp_path / "out", "--profile", "fast", "--overwrite", "-q")
+        assert ("40 packets longer than the descriptor gives" in done.stderr) == named, (stated, bytes_more)
+        assert run("run", path, "-o", tmp_path / "again", "--fail-on", "lost-samples").exit_code == 3 * named
 
 
 def test_check_notes_do_no_harm_unless_strict(tmp_path):

@@ -152,7 +152,7 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
             counts["cube"] = list(slice_output.write_cube(cube, kept, meta, reader.facts.crs, overwrite=overwrite))
         if writer:
             writer.commit()
-    talk(*(f"{strip}: warning: {line}" for line in (*reader.facts.warnings, *scan.mixed)))
+    talk(*(f"{strip}: warning: {line}" for line in (*reader.facts.warnings, *scan.doubts)))
     if scan.broken:
         talk(f"{strip}: warning: packets of {count(scan.broken, 'point')} cannot be used; `wavebatch check` says why")
     if not counts["lines"]:

@@ -47,6 +47,7 @@ WARNINGS = {
     "packets": "packets, or the vectors of their points, are unusual; they are used",
     "lost-points": "the header claims fewer points than the file seems to hold: the others are not read",
     "lost-packets": "points whose packets cannot be used: they are written without attributes",
+    "lost-samples": "packets are longer than their descriptor gives: what lies behind is not read",
     "foreign-packets": "the packets, or the return locations, do not belong to the points",
     "empty": "no points, no waveforms or no echoes",
     "nothing-selected": "the selection leaves no point",
@@ -61,7 +62,7 @@ WARNINGS = {
     "reflectance": "more reflectances above 1 than surfaces explain",
     "beam": "the divergence contradicts the widths of the echoes",
     "zone": "echoes may have been taken for those of another pulse, so that ranges are off by hundreds of metres",
-    "units": "coordinates may be in other units than the vectors of the packets, or returns off their rays",
+    "units": "coordinates may be wrong, in other units than the vectors of the packets, or returns off their rays",
     "dropped-records": "records of the strip that its cloud does not have",
 }
 """What makes results of a strip doubtful, by a code that stays the same in later versions."""

@@ -197,8 +197,7 @@ def doubt_files(facts: StripFacts, scan: StripScan) -> Iterator[StripWarning]:
         yield StripWarning("lost-points" if line in facts.unread else "header", line)
     losses = tuple(describe_oddities(scan.reasons, 0))  # points whose packets cannot be used
     for line in scan.warnings:
-        code = "lost-packets" if line in losses else "foreign-packets" if line in scan.mixed else "packets"
-        yield StripWarning(code, line)
+        yield StripWarning("lost-packets" if line in losses else scan.doubts.get(line, "packets"), line)
 
 
 def doubt_packets(facts: StripFacts, matched: int, returns: int) -> Iterator[str]:

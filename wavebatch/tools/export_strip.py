@@ -93,7 +93,7 @@ def export_strip(
             repaired.append(
                 f"{count(scan.short, 'point')} had packets shorter than their descriptor; now descriptors fit"
             )
-        doubts = (f"warning: {line}" for line in (*facts.warnings, *scan.mixed))
+        doubts = (f"warning: {line}" for line in (*facts.warnings, *scan.doubts))
         repaired += [*scan.notes, *audit_header(reader, scan), *doubts]
         source = {"file": facts.path.name, **take_fingerprint(facts.path, facts.packets.file)}
         account = json.dumps({"export": source, "repaired": repaired, "version": __version__}, sort_keys=True)

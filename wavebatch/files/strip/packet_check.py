@@ -369,6 +369,8 @@ class Judged:
     """bool (n,): usable, but the packet has fewer samples than its descriptor gives."""
     packed: np.ndarray
     """bool (n,): samples follow each other without a gap; see `unpack_samples`."""
+    ends: Sequence[tuple[int, int]]
+    """Least and largest stored X, Y and Z; empty without points."""
 
     @property
     def usable(self) -> np.ndarray:
@@ -434,7 +436,8 @@ class Judge:
                 raise refuse_compressed(self._facts.path, self._facts.compression[int(used[np.argmax(bad)])])
         geometry = Geometry(form == "range", PS_PER_NS / HALF_C, RANGE_RATIO, MAX_LOCATION)
         reason, n_samples, keys, short, packed = judge_packets(fields, self._rules, geometry)
-        far = self._find_far(points, form, n_samples)
+        ends = [(int(points[axis].min()), int(points[axis].max())) for axis in "XYZ"] if len(points) else []
+        far = self._find_far(points, form, n_samples, ends)
         reason[far], n_samples[far], short[far] = Reason.AT_LIMIT, 0, False
         if overfull is not None and len(overfull):
             place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
@@ -457,18 +460,19 @@ class Judge:
                 packets.close()
             broken = rows[~good]
             reason[broken], n_samples[broken], short[broken] = Reason.DAMAGED, 0, False
-        return Judged(reason, n_samples, keys, short, packed)
+        return Judged(reason, n_samples, keys, short, packed, ends)
 
-    def _find_far(self, points: np.ndarray, form: str, n_samples: np.ndarray) -> np.ndarray:
+    def _find_far(
+        self, points: np.ndarray, form: str, n_samples: np.ndarray, ends: Sequence[tuple[int, int]]
+    ) -> np.ndarray:
         """Return the rows of points with usable packets whose echoes may lie beyond the integers of the file.
 
         One damaged coordinate (-2^31) would otherwise fail the strip, and make a grid of voxels as wide as the Earth.
         """
-        stored = [points[axis] for axis in "XYZ"]
-        if not len(points) or max(max(int(one.max()), -int(one.min())) for one in stored) < MOST_STORED // 2:
+        if max((max(-low, high) for low, high in ends), default=0) < MOST_STORED // 2:
             return np.empty(0, np.int64)
         far = np.flatnonzero(n_samples)
-        xyz = np.stack([one[far].astype(np.float64) for one in stored], axis=1)
+        xyz = np.stack([points[axis][far].astype(np.float64) for axis in "XYZ"], axis=1)
         location = np.abs(widen_integers(points["return_point_wave_location"][far]))
         # From a return to an echo: at most its location and the length of the packet; an offset may double it.
         time = 2.0 * (location + PS_PER_NS * n_samples[far] * self._spacing[points["wavepacket_index"][far]])

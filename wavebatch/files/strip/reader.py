@@ -158,7 +158,8 @@ class StripReader(Closing):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             problems = (f"{stranger}; {remedy}",) if stranger and not force else ()
             warnings = (*scan.warnings, *mixed)
-            scan = replace(scan, stranger=stranger, problems=problems, mixed=mixed, warnings=warnings)
+            doubts = {**scan.doubts, **dict.fromkeys(mixed, "foreign-packets")}
+            scan = replace(scan, stranger=stranger, problems=problems, doubts=doubts, warnings=warnings)
         if scan.problems and not tolerant:
             scan.close()
             raise InputError(f"{self.facts.path}: {scan.problems[0]}")

@@ -26,7 +26,7 @@ from wavebatch.core.units import count
 from wavebatch.files.disk.raw_bytes import Closing, join_records, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
-from wavebatch.files.las.header import locate
+from wavebatch.files.las.header import LasHeader, locate
 from wavebatch.files.las.read_points import PointSource
 from wavebatch.files.strip import packet_check as check
 from wavebatch.files.strip.packets import PacketFile, StripFacts
@@ -229,8 +229,8 @@ class StripScan(Closing):
     """How samples are stored, by descriptor index; only descriptors whose counts are not simply read as they are."""
     stranger: str = ""
     """Why the packets are certainly those of another strip; empty where they are not, or where it was not asked."""
-    mixed: tuple[str, ...] = ()
-    """Those of `warnings` about points whose packets are not theirs."""
+    doubts: Mapping[str, str] = field(default_factory=dict)
+    """Those of `warnings` by which results are wrong, each with its code of `core.errors.WARNINGS`."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -259,6 +259,26 @@ def describe_oddities(reasons: dict[check.Reason, tuple[int, int]], short: int) 
         yield f"{where} with packets of fewer samples than their descriptor gives; these samples are used"
 
 
+def _find_bounds(header: LasHeader) -> list[tuple[float, float]]:
+    """Least and largest stored X, Y and Z that the header's bounds allow; infinite for an axis without bounds.
+
+    Points may lie as far outside as the box is wide: bounds that are rounded, or of shifted heights, are no damage.
+    Bounds that no stored coordinate reaches are in another unit; Leica wrote the stored integers.
+    """
+    ends = np.array([header.mins, header.maxs])
+    with np.errstate(all="ignore"):
+        slack = np.maximum(ends[1] - ends[0], ROUNDED * np.abs(header.scales))
+        stored, (low, high) = (
+            np.sort((of - header.offsets) / header.scales, axis=0) for of in (ends, ends + [-slack, slack])
+        )
+        known = (ends[0] < ends[1]) & np.isfinite(high - low) & np.all(np.abs(stored) <= check.MOST_STORED + 1)
+    return list(zip(np.where(known, low, -np.inf).tolist(), np.where(known, high, np.inf).tolist(), strict=True))
+
+
+PADDING = 8
+"""Fewer bytes behind the samples of a packet are no samples: packets may be filled up to whole words."""
+ROUNDED = 1000
+"""Steps of the coordinates to which bounds of a header may be rounded: a metre, in millimetres."""
 LONGEST_RUN = 64
 """Shorter runs of points with one GPS time (a pulse) are not cut by a border; longer ones are no pulses."""
 MOST_OVERLAP = 4
@@ -288,8 +308,15 @@ class _Tally:
     first: np.ndarray = field(default_factory=lambda: np.full(len(check.Reason), -1, np.int64))
     by_descriptor: np.ndarray = field(default_factory=lambda: np.zeros(256, np.int64))
     short: int = 0
+    long: int = 0
+    stray: int = 0
+    """Points far outside the bounds of the header."""
 
-    def add(self, points: np.ndarray, start: int, judged: check.Judged) -> None:
+    def add(self, points: np.ndarray, start: int, judged: check.Judged, bounds: list[tuple[float, float]]) -> None:
+        if any(least < low or most > high for (least, most), (low, high) in zip(judged.ends, bounds, strict=False)):
+            stored = (points[axis] for axis in "XYZ")
+            outside = [(one < low) | (one > high) for one, (low, high) in zip(stored, bounds, strict=True)]
+            self.stray += int(np.count_nonzero(np.logical_or.reduce(outside)))
         self.reasons += np.bincount(judged.reason, minlength=len(check.Reason))
         for reason in np.flatnonzero((self.reasons > 0) & (self.first < 0)).tolist():
             self.first[reason] = start + int(np.argmax(judged.reason == reason))
@@ -302,10 +329,22 @@ class _Tally:
         self.reasons += other.reasons
         self.by_descriptor += other.by_descriptor
         self.short += other.short
+        self.long += other.long
+        self.stray += other.stray
 
     def describe(self) -> dict[check.Reason, tuple[int, int]]:
         found = [reason for reason in check.Reason if reason in check.REASON_TEXTS and self.reasons[reason]]
         return {reason: (int(self.reasons[reason]), int(self.first[reason])) for reason in found}
+
+    def doubt(self) -> dict[str, str]:
+        doubts = {}
+        if self.long:
+            more = f"{count(self.long, 'packet')} longer than the descriptor gives: what lies behind is not read"
+            doubts[f"{more}, so echoes may be missing; get the strip with right descriptors"] = "lost-samples"
+        if self.stray:
+            where = f"{count(self.stray, 'point')} outside the bounds that the header claims, by more than their width"
+            doubts[f"{where}: points or header are damaged, or axes are swapped; get the file again"] = "units"
+        return doubts
 
 
 class ScanPart(Closing):
@@ -363,6 +402,7 @@ class Scanner:
         self._keeps = facts.header.compressed
         self._widths = np.zeros(256, np.int64)
         self._widths[list(facts.digitizers)] = [digitizer.width for digitizer in facts.digitizers.values()]
+        self._bounds = _find_bounds(facts.header)
         self._first = 0
         """Number of the first unit that is scanned."""
         none = np.empty(0, np.int64)
@@ -428,11 +468,11 @@ class Scanner:
                 problems.insert(0, f"{why}: put {name} next to the strip")
             else:
                 reason = max(reasons, key=lambda one: reasons[one][0])
-                count, first = reasons[reason]
+                number, first = reasons[reason]
                 remedy = f"{packet_file.name} is cut, damaged or belongs to another strip: get it again"
                 if reason is check.Reason.PACKED:
                     remedy = "write the packets with 8, 16 or 32 bits per sample"
-                problems.insert(0, f"no packet can be used: {count} of {points} points (first: point {first}) "
+                problems.insert(0, f"no packet can be used: {number} of {points} points (first: point {first}) "
                                    f"{check.REASON_TEXTS[reason]}; {remedy}")  # fmt: skip
         low, high = facts.packets.offsets
         most = MAX_RETURNS if suspects.any() else MOST_OVERLAP
@@ -456,7 +496,8 @@ class Scanner:
             overfull=overfull,
             context=found.context,
             decoded=found.decoded,
-            warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
+            warnings=(*describe_oddities(reasons, tally.short), *decision.warnings, *tally.doubt()),
+            doubts=tally.doubt(),
             problems=tuple(problems),
             forms=check.find_forms(facts.digitizers, self._packets, found.sample),
         )
@@ -505,7 +546,7 @@ class Scanner:
         if self._keeps and size <= self._sizes.kept_bytes:
             self._try_keeping(lambda: self._found.decoded.append(np.full(len(points), unit), points))
         judged = self._judge.judge(points, self._form)
-        self._found.tally.add(points, start, judged)
+        self._found.tally.add(points, start, judged, self._bounds)
         rows = np.flatnonzero(judged.usable)
         near = self._window.follow(start - self._sizes.window, judged.keys[rows], start + rows, unit, points)
         own = near.index >= start
@@ -514,8 +555,10 @@ class Scanner:
         new = rows[first[first >= 0]]
         some = new[even_places(len(new), max(check.SAMPLED_PER_UNIT // self._thinning, 1))]
         self._found.sample.append((judged.keys[some], judged.n_samples[some], judged.packed[some]))
-        width = np.take(self._widths, points["wavepacket_index"][new])
-        self._found.claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
+        least = judged.n_samples[new] * np.take(self._widths, points["wavepacket_index"][new])
+        size = points["wavepacket_size"][new]
+        self._found.claimed += int(np.minimum(least, size).sum())
+        self._found.tally.long += int(np.count_nonzero(size >= least + PADDING))
         if len(rows):
             step = max(1, self._thinning * len(rows) // _VOTERS)
             self._found.votes.add_points(take_whole_records(points, rows[::step]))

@@ -320,7 +320,7 @@ def voxelize_strip(
             summary.outside, summary.energy, summary.unknown = grid.outside, grid.energy, grid.unknown
             if calibration is None:
                 summary.warnings += (*name_gains(reader.facts, scan),)
-            summary.warnings += (*reader.facts.warnings, *scan.mixed)
+            summary.warnings += (*reader.facts.warnings, *scan.doubts)
             if scan.broken:
                 lost = f"packets of {count(scan.broken, 'point')} cannot be used; `wavebatch check` says why"
                 summary.warnings += (lost,)
