@@ -195,7 +195,7 @@ FILES = [
     ("compare strip.las x.las", 2, "x.las", {"x.las": "no cloud"}),
     *((f"{RUN} --profile fast --trajectory t.csv", 4, f"t.csv: .. {words}", {"t.csv": text}) for text, words in (
         ("time,x,y,z\n1,2,3,4\n2,3,4,5\n", "do not overlap on any clock"),
-        ("time,x,y,z\nonly,words,here,now\n", "no line of numbers follows the header in line 1"),
+        ("time,x,y,z\nonly,words,here,now\n", "no line of numbers, such as 12.5, follows the header in line 1"),
         ("time,x,y,z\n1,2,3,4\n", "1 usable positions"),
         ("time,lat,lon,h\n1,48,11,500\n2,48,11,500\n", "in degrees, but the strip has no CRS"))),
     *((f"{RUN} --trajectory t.csv", 2, f"t.csv: .. {words}", {"t.csv": text}) for text, words in (

@@ -34,7 +34,8 @@ COLUMN_NAMES: dict[str, tuple[str, ...]] = {
     "time": ("time", "gpstime", "gps", "t", "sow", "gpsseconds", "gpssow", "secondsofweek", "weekseconds", "timestamp"),
     "x": ("x", "easting", "east", "e", "utmeasting", "projx"),
     "y": ("y", "northing", "north", "n", "utmnorthing", "projy"),
-    "z": ("z", "height", "altitude", "alt", "h", "elevation", "ellipsoidalheight", "ellheight", "hell", "up"),
+    "z": ("z", "height", "altitude", "alt", "h", "elevation", "hell", "up",
+          "ellipsoidalheight", "ellipsoidheight", "ellheight"),
     "latitude": ("latitude", "lat"),
     "longitude": ("longitude", "lon", "long", "lng"),
     "roll": ("roll",),
@@ -92,7 +93,7 @@ def read_trajectory(
         body = (_split(line) for line in lines[place + 1 :])
         rows = [row for row in (_numbers(fields, len(listed)) for fields in body) if row is not None]
         if not rows:
-            raise InputError(f"{path}: no line of numbers follows the header in line {place + 1}")
+            raise InputError(f"{path}: no line of numbers, such as 12.5, follows the header in line {place + 1}")
         table = np.array(rows)
         columns = {name: table[:, i] for i, name in enumerate(listed) if name}
         columns = {name: np.radians(values) if name in _ATTITUDE else values for name, values in columns.items()}
