@@ -142,6 +142,8 @@ def test_text_has_every_figure(tmp_path):
     wanted = ("pulses            4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning           incomplete: 1 of 4")
     for text in wanted:
         assert text in result.stdout
+    less = CliRunner().invoke(stats, [str(path), "--where", "return_number < 3"]).stdout
+    assert "--where: 1 of 7 points are left out" in less and "incomplete" not in less  # what is left out is no tile's
     other = write_cloud(tmp_path / "d.las", **SMALL)
     table = tmp_path / "t.csv"
     assert "total" in CliRunner().invoke(stats, [str(path), str(other), "-o", str(table)]).stdout

@@ -202,7 +202,8 @@ def choose_radius(xyz: np.ndarray) -> float:
         group, offset = around.find(some, radius)
         return bool(np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))) <= 0.1)
 
-    # The first nearly always is; the wider ones are halved: neighbours take longest there.
+    # The first nearly always is; the wider ones are halved: neighbours take longest there. Where wider ones hold fewer
+    # lines, which hardly happens, the radius is one that is enough, though not the least.
     least = 0 if len(radii) == 1 or is_enough(first) else 1
     return radii[least and bisect_left(radii, True, 1, len(radii) - 1, key=is_enough)]
 

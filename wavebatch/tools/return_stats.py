@@ -570,7 +570,7 @@ class _Tally:
                 "pulse and distances are wrong"
             )
         incomplete = self.incomplete - self.crowded
-        if incomplete > 0.001 * whole.pulses:
+        if incomplete > 0.001 * whole.pulses and not self.left_out:  # the line about --where says it already
             lines.append(
                 f"incomplete: {incomplete} of {whole.pulses} pulses have another number of points than stored in "
                 "them; tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
