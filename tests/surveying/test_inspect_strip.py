@@ -190,7 +190,10 @@ def test_check_takes_chain_files(tmp_path):
     bad.write_text('[[chain]]\nstage = "detect.nothing"\n')
     stages = ("noise.pooled", "detect.maximum", "decompose.gaussian")
     good.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
-    assert run("check", good).exit_code == 0
+    assert "note: has no stage attribute.position, which `run` needs" in succeed("check", good).stdout
+    assert "needs" in run("run", data_file(RIEGL), "-o", tmp_path / "o", "--chain", good).stderr
+    good.write_text(good.read_text() + '[[chain]]\nstage = "attribute.position"\n')
+    assert succeed("check", good).stdout == f"{good}: ok (4 stages)\n"
     result = run("check", bad)
     assert result.exit_code == 1
     assert len(result.stdout.splitlines()) == 1 and "detect.nothing" in result.stdout

@@ -91,7 +91,8 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
             chain = load_chain_file(path)
         except (ConfigError, InputError) as error:
             return Findings(str(path), (_without_name(path, error),), ())
-        return Findings(str(path), (), (), f"{len(chain.steps)} stages")
+        need = "has no stage attribute.position, which `run` needs; `compare` and `bench` do without"
+        return Findings(str(path), (), (need,) * ("x" not in chain.makes), f"{len(chain.steps)} stages")
     try:
         with (
             StripReader(path, direction=direction, headerless=headerless) as reader,
