@@ -179,7 +179,7 @@ def take_energies(
     if apart:
         notes.append(
             f"the light of neighbouring pulses alternates by a factor of {math.exp(-apart):.2f}, as of two lasers or "
-            f"gains without a mark: the error of the constant grows by {100 * apart * 0.5**0.5:.0f} %; give --energy"
+            f"gains without a mark: {100 * apart * 0.5**0.5:.0f} % of error of calibrated values; give --energy"
         )
         growth = math.hypot(growth, apart * 0.5**0.5)
     # An error of the log from shot to shot that was not in the calibration's.
