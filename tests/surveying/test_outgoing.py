@@ -155,11 +155,11 @@ def strip(tmp_path, rng):
     return _strip(tmp_path / "s.las", energies), energies
 
 
-def _filled(path, request, brighter=None):
+def _filled(path, request, brighter=None, missed=0.0):
     with StripReader(path) as reader, reader.scan() as scan:
         energy = find_pulse_energy(reader, scan, request)
         if brighter is not None:  # the mean of the calibration over that of the strip
-            energy = replace(energy, reference=brighter * energy.mean)
+            energy = replace(energy, reference=brighter * energy.mean, missed=missed)
         blocks = [
             block if energy is None else energy.fill(block, unit)
             for unit in reader.read_units(scan)
@@ -181,6 +181,8 @@ def test_the_column_of_an_import_is_used_without_being_asked_for(strip):
     # Under a calibration of pulses twice as strong it counts half, and so does its error.
     half, doubt = _filled(path, None, brighter=2.0)
     assert np.allclose(half, energy / 2) and np.allclose(doubt, error / 2)
+    _, doubt = _filled(path, None, brighter=1.0, missed=0.1)
+    assert np.allclose(doubt, np.hypot(error, 0.1 * energy))
     assert [PulseEnergy("", mean=3.0, reference=one).level for one in (None, 2.0)] == [1.0, 1.5]
     assert _filled(path, "none") is None
     energy, _ = _filled(path, "pulse_energy")
