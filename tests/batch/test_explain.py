@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -200,6 +201,13 @@ def test_few_waveforms_and_usual_shares_of_failed_fits_are_not_judged(prepared, 
     for report, code, expected in ((failed, "failed-fits", judged), (RunReport(counts=seen), "empty", enough)):
         codes = [one.code for one in find_warnings(prepared, report, (), {})]
         assert codes == [code] * expected
+
+
+def test_a_forced_survey_and_records_that_are_lost_have_their_codes(prepared):
+    counts = dict.fromkeys(("points_in", "waveforms", "echoes"), 1)
+    forced = replace(prepared, forced="its noise is 3 DN")
+    found = find_warnings(forced, RunReport(counts=counts), (), {"GDAL 7": "too long"})
+    assert [one.code for one in found] == ["forced-system", "dropped-records"]
 
 
 @pytest.mark.parametrize(
