@@ -31,6 +31,7 @@ from wavebatch.surveying.measuring.misfit import (
     limit_faint,
     measure_beside,
     measure_tail,
+    share_fixed,
     share_repeated,
     suspect_pairs,
 )
@@ -228,7 +229,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
 
     guessed: whether the growth of noise in `system` is a guess, or False where fits showed it; None before both.
     """
-    first, figures, repeated, lowered = system, Figures(), [], 0.0
+    first, figures, repeated, lowered, fixed_share = system, Figures(), [], 0.0, 0.0
     candidates: tuple[Tried, ...] = ()
     if learn:
         clear = find_clear(block, system)
@@ -299,8 +300,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
         repeated_share = share_repeated(echoes, system.sigma_ref)
         if repeated_share > MOST_DOUBTED:
             system, echoes = cover_repeated(part, system, echoes)
+        fixed_share = share_fixed(echoes, len(part), block.spacing)
         figures.width_in_doubt = choice.spread
-        figures.echoes_in_doubt = max(choice.doubt, doubt, left, repeated_share)
+        figures.echoes_in_doubt = max(choice.doubt, doubt, left, repeated_share, fixed_share)
     else:
         part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
@@ -316,6 +318,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
     system = measure_skew(part, system, echoes) if learn else system
     figures = describe_scene(figures, part, system, echoes, MIN_SNR)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
+    if fixed_share:
+        reason = f"{100 * fixed_share:.0f} % of the echoes stand at one sample of most waveforms and are as high: "
+        reason += "they are the receiver's, as a start pulse that leaks; leave them out"
+        decisions = (*decisions, Decision("echoes at one sample", True, reason))
     if lowered:
         reason = f"noise is {system.noise.std:.2f} DN without them, {lowered:.2f} with them; the echoes found "
         reason += "with less noise describe the waveforms shorter, and few of them are false"

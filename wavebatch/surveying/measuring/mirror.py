@@ -84,17 +84,18 @@ def look_in_mirror(
     np.maximum.at(top, echoes.waveform, echoes.amplitude)
     strong = (echoes.amplitude == top[echoes.waveform]) & (echoes.amplitude > STRONG * system.noise.std)
     mains = echoes.take(np.flatnonzero(strong))
-    false = []
+    # Of the energy of echoes, as a decomposition asks for it, in standard deviations of noise.
+    unit, false = np.sqrt(SQRT_PI / block.spacing) / system.noise.std, []
     # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse.
     for detect in (matched_filter, maximum):
         other = find_echoes(mirrored, system, detect, **SEARCH)[2]
         alone = np.ones(len(other), bool)
         alone[match_echoes(other, echoes, SAME * width).found] = False
         rest = other.take(np.flatnonzero(alone))
-        energy = _measure_energy(rest, system, block.spacing)
+        energy = rest.amplitude * np.sqrt(rest.sigma) * unit
         beside, quiet = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
         false.append((energy[beside], energy[quiet]))
-    energy = _measure_energy(echoes, system, block.spacing)
+    energy = echoes.amplitude * np.sqrt(echoes.sigma) * unit
     for level in levels:
         most = [max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True)]
         yield level, Mirror(len(mains), most[0], int(np.count_nonzero(energy >= level)), most[1])
@@ -128,11 +129,6 @@ def count_holes(system: SystemPulse, explained: Explained, spacing: float) -> in
     highest = sums.model[row[:, None], near].max(axis=1, initial=0.0)
     noise = HOLDS * np.sqrt((system.noise.std**2 + system.noise.gain * highest) / energy)
     return int(np.count_nonzero(middle[row, place] > np.maximum(noise, LACK * highest)))
-
-
-def _measure_energy(echoes: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
-    """Energy of echoes, over that of noise [standard deviations], as a decomposition asks for it."""
-    return echoes.amplitude * np.sqrt(echoes.sigma / spacing * SQRT_PI) / system.noise.std
 
 
 def _lie_far(rest: EchoTable, echoes: EchoTable, reach: float) -> np.ndarray:

@@ -125,6 +125,11 @@ MOST_REPEATED, MOST_LACKED = 0.05, 0.016
 """Share of the echoes that may repeat beside stronger ones once a misfit covers what does: of real strips .03 do. And
 the largest misfit that does: more is a second target, as rows of crops have, and no error of six Gaussians."""
 
+MOST_HAVE, FIXED, ONE_PLACE = 0.5, 4.0, 1.2
+"""Share of the waveforms that have an echo at one sample, and at least one elsewhere, where the receiver makes the
+first; errors of a time by which these lie apart; and scatter of times and amplitudes over their errors that shows no
+target: behind a trigger it is 2.8 at an amplitude of 10 noises."""
+
 LEAST_MISFIT, MOST_MISFIT, STEP_OF_MISFITS = 0.0005, 0.128, 2**0.5
 """Misfits of a pulse: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it is no pulse of this
 strip; and step by which they are raised."""
@@ -284,6 +289,37 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
     more = number[:, 0] - beside
     more = more[(more >= FEW) & (more > SURE * np.sqrt(number[:, 0] + beside))]
     return max(most, float(more.max(initial=0))) / max(len(echoes), 1)
+
+
+def share_fixed(echoes: EchoTable, number: int, spacing: float) -> float:
+    """Share of the echoes that stand at one sample of most waveforms, all of one height; 0 where these are the scene.
+
+    The receiver makes them: a start pulse that leaks, a window before it. Noise alone moves them, so that times scatter
+    as their errors say, and amplitudes hardly more. First echoes behind a trigger move by half a sample too.
+
+    Parameters
+    ----------
+    echoes : EchoTable
+        Of a sample.
+    number : int
+        Of its waveforms.
+    spacing : float
+        Of their samples [ns].
+    """
+    ordered = np.sort(echoes.time)
+    after = np.searchsorted(ordered, ordered + spacing + FIXED * median(echoes.time_err)) if len(ordered) else ordered
+    many = after - np.arange(len(ordered))
+    if not len(many) or many.max() < MOST_HAVE * number:
+        return 0.0
+    first = int(np.argmax(many))
+    here = (echoes.time >= ordered[first]) & (echoes.time <= ordered[int(after[first]) - 1])
+    varies = np.hypot(echoes.amplitude_err, VARIES * echoes.amplitude)
+    for value, error in ((echoes.time, echoes.time_err), (echoes.amplitude, varies)):
+        off = np.abs(value[here] - median(value[here])) / error[here]
+        if not MAD_TO_STD * median(off) < ONE_PLACE:
+            return 0.0
+    others = len(distinct(echoes.waveform[~here])) >= MOST_HAVE * number
+    return float(np.mean(here)) if others else 0.0
 
 
 def _list_distances(echoes: EchoTable, width: float) -> tuple[np.ndarray, np.ndarray]:
