@@ -284,10 +284,12 @@ def folder(tmp_path_factory):
 
 
 def test_a_survey_that_is_only_shown_looks_for_no_other_strips(folder):
-    shown = survey(folder / "flat.las", for_checks=False)
+    shown = survey(folder / "flat.las", for_checks=False, find_divergence=True)
     assert shown.figures.look is None and not shown.figures.kinds
     saved = load_survey(folder / "SYSTEM.toml").survey
     assert saved.figures.look is not None and shown.system.sigma_ref == pytest.approx(saved.system.sigma_ref)
+    assert saved.system.beside and not shown.system.beside, "errors of echoes that nobody measures"
+    assert shown.figures == replace(saved.figures, look=None, kinds={}), "what is printed is what would be saved"
     result = run_command("survey", folder / "flat.las", "--json")
     assert "flight_width" in json.loads(result.stdout)["figures"], "all figures, although no file is written"
 

@@ -144,7 +144,9 @@ def see_swath(half_angle):
     back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
     block = replace(made.block, sensor=made.rays.ground - back)
     surveyed = survey_block(block).system.with_radiometry(divergence=SCENE.divergence)
-    return Slopes(block, lambda row: (made.rays.incidence[row], np.full(len(row), np.radians(0.3)))), surveyed
+    rows = np.repeat(np.arange(len(block))[:, None], 3, axis=1)  # in the place of places
+    angles = made.rays.incidence, np.full(len(block), np.radians(0.3))
+    return Slopes(block, rows, lambda place, _: tuple(values[place[:, 0]] for values in angles)), surveyed
 
 
 @pytest.mark.parametrize("half_angle", [10.0, 25.0])
@@ -161,12 +163,10 @@ def test_level_ground_is_told_from_the_swath(half_angle):
 def test_slopes_are_seen_in_samples_of_a_few_waveforms():
     """Without a divergence some waveforms of each tell whether any slope is known."""
     known, surveyed = see_swath(25.0)
-    parts = [
-        Slopes(known.block.rows(slice(row, row + 2)), lambda own, row=row: known.measure(row + own))
-        for row in range(0, 1000, 2)
-    ]
+    cuts = [slice(row, row + 2) for row in range(0, 1000, 2)]
+    parts = [known._replace(block=known.block.rows(cut), place=known.place[cut]) for cut in cuts]
     pulse = surveyed.with_radiometry(divergence=None)
-    whole = measure_reference([Slopes(known.block.rows(slice(0, 1000)), known.measure)], pulse, known.block.spacing)
+    whole = measure_reference([known._replace(block=known.block.rows(slice(0, 1000)))], pulse, known.block.spacing)
     found = measure_reference(parts, pulse, known.block.spacing)
     assert whole.echoes > 0 and found.echoes == whole.echoes
 
@@ -186,7 +186,8 @@ def test_a_digitizer_has_the_beam_of_its_strip_and_its_error():
 def test_a_reference_that_no_surface_shows_is_no_reference():
     block = simulate_seed_block(make_scene("empty"), 1, 0).block
     system = SystemPulse(2.0, radiometry=Radiometry(divergence=0.5))
-    unknown = Slopes(replace(block, sensor=block.origin), lambda row: np.full((2, len(row)), np.nan))
+    place = block.origin
+    unknown = Slopes(replace(block, sensor=place), place, lambda places, _: np.full((2, len(places)), np.nan))
     for samples in ([], [unknown], [unknown._replace(block=block)]):
         seen = measure_reference(samples, system, 1.0)
         assert np.isinf(seen.system.widths.error) and seen.divergence is None and seen.echoes == 0

@@ -81,9 +81,11 @@ class Slopes(NamedTuple):
 
     block: WaveformBlock
     """With the sensor's positions."""
-    measure: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-    """Angle and its standard deviation [rad] of some waveforms, by their rows (m,); NaN where the points around form no
-    plane. It takes longer than to find which echoes can use it."""
+    place: np.ndarray
+    """Of the last return of each waveform, f8 (n, 3) [m]; NaN without any."""
+    measure: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    """Angles and their standard deviations [rad] at places, by the rays' directions (m, 3); NaN where the points around
+    form no plane. One for all waveforms of a unit. It takes longer than to find which echoes can use it."""
 
 
 @frozen
@@ -232,21 +234,21 @@ def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_wa
         xyz = _list_places(reader, unit)
         radius = radius or choose_radius(xyz)  # one for all, as a run has it
         around = Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
+        measure = partial(_measure_angles, around, radius)
         for block, _ in reader.read_rows(unit, rows, 4096):
-            # At the last return of each waveform.
             block = fill.fill(block)
             place = np.full((len(block), 3), np.nan)
             if block.returns is not None:
                 place[block.returns.waveform] = block.returns.xyz
-            yield Slopes(block, partial(_measure_angles, place, block.direction, around, radius))
+            yield Slopes(block, place, measure)
 
 
 def _measure_angles(
-    place: np.ndarray, direction: np.ndarray, around: Surroundings, radius: float, row: np.ndarray
+    around: Surroundings, radius: float, place: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Angles between rays and surfaces around places, as `Slopes` has them."""
     (angle, error), _ = measure_normals(
-        place[row], direction[row], around, radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR
+        place, direction, around, radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR
     )
     return np.radians(angle.astype(np.float64)), np.radians(error.astype(np.float64))
 
@@ -274,8 +276,12 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
     if system.radiometry.divergence is None:
         # Without any known slope, nothing is decomposed: some waveforms of each sample tell.
         share = max(sum(len(one.block) for one in samples) / PROBED, 1.0)
-        rows = (spread_rows(len(one.block), math.ceil(len(one.block) / share)) for one in samples)
-        if not any(np.isfinite(one.measure(own)[0]).any() for one, own in zip(samples, rows, strict=True) if len(own)):
+        probed: dict[Callable, list[tuple[np.ndarray, np.ndarray]]] = {}
+        for one in samples:
+            own = spread_rows(len(one.block), math.ceil(len(one.block) / share))
+            probed.setdefault(one.measure, []).append((one.place[own], one.block.direction[own]))
+        units = ((measure, map(np.concatenate, zip(*parts, strict=True))) for measure, parts in probed.items())
+        if not any(np.isfinite(measure(*rays)[0]).any() for measure, rays in units):
             return GroundReference(system, 0)
     for sample in samples:
         block, index = sample.block, sample.block.digitizer.index
@@ -338,7 +344,7 @@ def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform
     off = block.origin[row] + block.direction[row] * echoes.time[:, None] - np.asarray(block.sensor)[row]
-    angle, angle_err = sample.measure(row)
+    angle, angle_err = sample.measure(sample.place[row], block.direction[row])
     arm = 0.5 / C * np.sqrt((off * off).sum(axis=1))
     lever = (arm * np.tan(angle)) ** 2
     lever_err = 2.0 * arm * arm * np.tan(angle) / np.cos(angle) ** 2 * angle_err
@@ -511,6 +517,10 @@ def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergen
         Where the coordinates are not in metres.
     """
     system = survey.system.with_radiometry(divergence=divergence)
+    if divergence is None:  # errors without hidden neighbours, which a survey that is only printed does not measure
+        plain: dict[str, Any] = {"beside": (), "hidden": (), "hidden_light": (), "hidden_width": ()}
+        others = {index: replace(other, **plain) for index, other in system.digitizers.items()}
+        system = replace(system, **plain, digitizers=others)
     source = find_sensor(reader, scan, SensorRequest())
     spacing, figures = survey.figures.spacing_ns or 0.0, survey.figures
     seen = None if source.distance is None else sample_reference(reader, scan, source, system, spacing)
@@ -526,6 +536,6 @@ def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergen
         outlook = predict_angles(system, spacing, source.distance or 0.0, divergence, figures.amplitude_50 or 0.0)
         if seen.doubt():
             outlook = replace(outlook, reason=f"{seen.doubt()}; {outlook.reason}")
-    others = (decision for decision in survey.decisions if decision.part != Part.ANGLE)
-    decisions = (*others, Decision(Part.ANGLE, outlook.possible, outlook.reason))
+    kept = (decision for decision in survey.decisions if decision.part != Part.ANGLE)
+    decisions = (*kept, Decision(Part.ANGLE, outlook.possible, outlook.reason))
     return replace(survey, system=system, figures=figures, decisions=decisions)

@@ -69,7 +69,7 @@ LEAST_RINGING = 0.01
 """Share of an echo from which what a Gaussian leaves after each one is an after-pulse, whose echoes get a flag."""
 
 
-def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
+def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True, errors: bool = True) -> Survey:
     """Survey of a strip from blocks sampled over it.
 
     Parameters
@@ -78,6 +78,8 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
         Of any descriptors and lengths, in any order.
     learn : bool
         Also learn the pulse's shape; without it the pulse is the Gaussian of the isolated echoes' width.
+    errors : bool
+        Also measure what neighbours that are not found do to echoes, which only errors hold.
 
     Returns
     -------
@@ -112,7 +114,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
         begin = measure_begin(main)
     raw = main
     main, plain = clean_sample(raw, begin)
-    found = _survey(main, plain, learn=learn)
+    found = _survey(main, plain, learn=learn, errors=errors)
     note_counts(found.figures, raw)
     found.figures.descriptors_pooled = float(len(members))
     if others:
@@ -122,7 +124,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
             own = found.system
             strange = strangers.get(block.digitizer.index)
             if strange or not _records_alike(plain, main, block):
-                own = _survey_other(found.system, block, learn=learn)
+                own = _survey_other(found.system, block, learn=learn, errors=errors)
                 own_systems.update({member.digitizer.index: own for member in members})
                 reason = strange or "its bits, spacing, gain, offset, level, noise or pulse differ from the main one's"
                 named.append(Decision(f"digitizer {block.digitizer.index}", True, reason))
@@ -191,9 +193,9 @@ def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock
     return bool(alike and abs(clips - 1) < 0.01)
 
 
-def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> SystemPulse:
+def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool, errors: bool) -> SystemPulse:
     """The system of another digitizer; where its echoes are too few for a pulse, the main one's with its noise."""
-    own = survey_block(block, learn=learn)
+    own = survey_block(block, learn=learn, errors=errors)
     if not learn or (own.figures.isolated_echoes or 0.0) >= FEW:
         return own.system
     measured = measure_gaussian(block, system.sigma_ref / block.spacing)
@@ -203,11 +205,11 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     return limit_faint(replace(other, faint_share=MOST_FAINT), system.faint_share / PEAK, echoes)
 
 
-def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
+def survey_block(block: WaveformBlock, *, learn: bool = True, errors: bool = True) -> Survey:
     """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
     if not len(block):
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
-    found = _survey(*clean_sample(block, measure_begin(block)), learn=learn)
+    found = _survey(*clean_sample(block, measure_begin(block)), learn=learn, errors=errors)
     note_counts(found.figures, block)
     return found
 
@@ -224,7 +226,9 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
     return block, replace(measure_whole(block, begin, cleaned=True), defects=found.defects)
 
 
-def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: bool | None = None) -> Survey:
+def _survey(
+    block: WaveformBlock, system: SystemPulse, *, learn: bool, errors: bool, guessed: bool | None = None
+) -> Survey:
     """As survey_block, from noise and width by `clean_sample`; once more where noise grows with the signal.
 
     guessed: whether the growth of noise in `system` is a guess, or False where fits showed it; None before both.
@@ -235,7 +239,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
         clear = find_clear(block, system)
         growth = guess_growth(block, system, clear) if guessed is None else 0.0
         if growth > 0:
-            return _survey(block, measure_again(block, first, growth), learn=learn, guessed=True)
+            return _survey(block, measure_again(block, first, growth), learn=learn, errors=errors, guessed=True)
         main = find_isolated(block, system, clear)
         figures.isolated_echoes = len(main)
         # What is clear is an echo also beside the strongest ones: else the pulse that is learned has it in its tail.
@@ -270,7 +274,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
         echoes = decompose_sample(part, borne)
         system = measure_residuals(part, system, echoes)
         if guessed or (guessed is None and system.noise.gain > 0):
-            return _survey(block, measure_again(block, first, system.noise.gain), learn=learn, guessed=False)
+            again = measure_again(block, first, system.noise.gain)
+            return _survey(block, again, learn=learn, errors=errors, guessed=False)
         noise, looked = lower_noise(part, replace(borne, noise=system.noise))
         if noise is not system.noise:
             lowered = system.noise.std
@@ -314,7 +319,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool, guessed: 
         excess = median(lack**2) / SQUARED_NORMAL_MEDIAN - median(echoes.sigma_err[below].astype(np.float64) ** 2)
         scatter = float(np.sqrt(max(excess, 0.0)))
     widths = LevelWidths(scatter=scatter)
-    system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)
+    system = measure_hidden(part, measure_beside(part, system, echoes), echoes) if errors else system
+    system = replace(system, widths=widths)
     system = measure_skew(part, system, echoes) if learn else system
     figures = describe_scene(figures, part, system, echoes, MIN_SNR)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))

@@ -416,7 +416,9 @@ def measure_covariance(
         # Slow noise: a variogram is higher at each of its last lags than at those before.
         if lag > lags and not (min(half[-RISE:]) > max(half[-2 * RISE : -RISE])):
             break
-        number, square = found[lag - 1] if lag <= lags else _pair_differences(alone, marks, lag, lag)[0]
+        if lag > len(found):  # many at a time: a call takes as long as a lag
+            found += _pair_differences(alone, marks, lag, min(lag + RISE - 1, last))
+        number, square = found[lag - 1]
         if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
             break
         half.append(0.5 * square / number)
