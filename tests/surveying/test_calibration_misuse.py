@@ -3,6 +3,7 @@
 import json
 import shutil
 import struct
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -1033,6 +1034,41 @@ def test_maps_that_are_stretched_are_refused_by_their_crs(tmp_path, calibrated, 
     assert all(sensor.MERCATOR.search(text) for text in parts)
     for name in ("Transverse_Mercator", "Hotine_Oblique_Mercator"):
         assert not sensor.MERCATOR.search(f'PROJCS["Mercator",GEOGCS[],PROJECTION["{name}"]')
+
+
+@pytest.mark.parametrize(("number", "stretch"), [*((n, 1.0) for n in (2, 3, 5, 10, 20, 200)), (200, 1.4)])
+def test_few_rays_show_no_stretched_map(rng, number, stretch):
+    """Cuts of 2 to 10 points of a real strip were refused: rounded vectors of one direction are on any line."""
+    angle = np.radians(rng.uniform(-15.0, 15.0, (300, 1)) + 0.1 * rng.standard_normal((300, number)))
+    ray = 1.499e-4 * np.stack([stretch * np.sin(angle), 0.0 * angle, -np.cos(angle)], axis=-1)
+    stored = np.round(ray, 8).astype("f4").astype(float)
+    if number == 200:  # of the whole strip
+        stored = stored[:, :1].swapaxes(0, 1)
+    assert {sensor._measure_stretch(rays) > 0.0 for rays in stored} == {stretch != 1.0}
+
+
+@pytest.mark.parametrize(
+    ("projection", "north", "scale"),
+    [
+        ('PROJECTION["Mercator_2SP"],PARAMETER["standard_parallel_1",-41]', -3_767_000.0, None),
+        ('METHOD["Mercator (variant B)"],PARAMETER["Latitude of 1st standard parallel",-41]', -3_767_000.0, None),
+        ('PROJECTION["Mercator_2SP"],PARAMETER["standard_parallel_1",-41]', 0.0, "0.76"),
+        ('PROJECTION["Mercator_1SP"],PARAMETER["scale_factor",0.997],PARAMETER["false_northing",900000]', 1.1e6, None),
+        ('PROJECTION["Mercator_1SP"],PARAMETER["scale_factor",1],PARAMETER["false_northing",0]', 6.1e6, "1.49"),
+        ('PROJECTION["Mercator"],PARAMETER["Standard_Parallel_1",0.0]', 6.1e6, "1.49"),
+        ('METHOD["Mercator (variant C)"],PARAMETER["Latitude of 1st standard parallel",40]', 6.1e6, None),
+        ("EPSG:3994", -3_767_000.0, None),
+    ],
+)
+def test_mercator_maps_are_refused_away_from_where_they_are_true(calibrated, monkeypatch, projection, north, scale):
+    """Mercator 41 is true to scale in New Zealand, and was refused there."""
+    monkeypatch.setattr(sensor, "measure_scale", lambda reader, scan: PairScale())
+    with StripReader(calibrated / "a.las") as reader, reader.scan() as scan:
+        header = SimpleNamespace(mins=(0.0, north - 500.0, 0.0), maxs=(900.0, north + 500.0, 90.0), point_count=9)
+        facts = SimpleNamespace(path="a.las", units=[], header=header, crs=projection)
+        text = "" if scale is None else f"whose metres are {scale} times as long here as on the ground"
+        with nullcontext() if scale is None else pytest.raises(InputError, match=text):
+            sensor.refuse_units(SimpleNamespace(facts=facts), scan)
 
 
 def test_strips_of_two_zones_are_not_tied(tmp_path, dim_edges):

@@ -58,12 +58,19 @@ FOOT = 0.3048
 LEAST_OVERLAPS = 3
 """Smallest number of overlapping windows whose positions show by how much the motion leaves the fits' polynomials."""
 
-MERCATOR = re.compile(r'(?:projection|method)\s*\[\s*"(?:mercator|popular)|^epsg:(?:3857|3395)\b', re.IGNORECASE)
-"""WKT, or code, of the projections of web maps and sea charts, whose metres are longer than those on the ground."""
+MERCATOR = re.compile(
+    r'(?:projection|method)\s*\[\s*"(?:mercator(?!.{1,2}variant.c)|popular)|^epsg:(?:3857|3785|3395)\b', re.IGNORECASE
+)
+"""WKT, or code, of the projections of web maps and sea charts, whose metres are those on the ground at one latitude
+only. Variant C counts its northings from anywhere; of other codes the parameters are not known here."""
 
-EARTH, STRETCHED, OFF_LINE = 6_378_137.0, 0.01, 1e-3
-"""Radius of the Earth [m]; stretch of a map above which ranges and slopes are wrong: maps for surveys have 0.001; and
-share of the variance by which vectors may be off the line that shows it: those of real strips are off by 1e-5."""
+SCALING = re.compile(r'(standard|scale|false).(?:parallel|factor|northing)[^"]*"\s*,\s*([-+.\de]+)', re.IGNORECASE)
+"""Parameters of a WKT that say at which latitude that is, and from where northings count."""
+
+EARTH, FLAT, STRETCHED, OFF_LINE = 6_378_137.0, 0.00669, 0.01, 1e-3
+"""Radius of the Earth [m] and square of its eccentricity; stretch of a map above which ranges and slopes are wrong:
+maps for surveys have 0.001; and share of the variance by which vectors may be off the line that shows it: those of real
+strips are off by 1e-5."""
 
 JERK, JERK_LEFT = 1.0, 0.025
 """Change of acceleration of an aircraft in turbulent air [m/s3], assumed where fewer windows overlap; and what a
@@ -314,17 +321,21 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
 def refuse_units(reader: StripReader, scan: StripScan) -> None:
     """Raise InputError where the coordinates are not in metres, or where the packets make that doubtful."""
     path, units, ratio, remedy = reader.facts.path, reader.facts.units, scan.vectors.ratio, PROJECT
-    low, high = (ends[1] for ends in (reader.facts.header.mins, reader.facts.header.maxs))
-    map_scale = float(np.cosh(np.clip(0.5 * (low + high) / EARTH, -9.0, 9.0)))
-    if map_scale > 1.0 + STRETCHED and MERCATOR.search(reader.facts.crs or ""):
-        raise InputError(
-            f"{path}: coordinates are of a Mercator projection, whose metres are {map_scale:.2f} times as long here as "
-            f"on the ground: {remedy}"
-        )
     for unit in units:
         if not unit.is_metric:
             why = "which have no height" if unit.kind == "geocentric" else "so ranges would not be in metres"
             raise InputError(f"{path}: coordinates are {unit.describe()}, {why}: {remedy}")
+    if projection := MERCATOR.search(reader.facts.crs or ""):
+        given = {name.lower(): float(value) for name, value in SCALING.findall(projection.string, projection.end())}
+        sine = np.sin(np.radians(given.get("standard", 0.0)))
+        least = given.get("scale", 1.0) * ((1.0 - sine**2) / (1.0 - FLAT * sine**2)) ** 0.5
+        low, high = (ends[1] - given.get("false", 0.0) for ends in (reader.facts.header.mins, reader.facts.header.maxs))
+        map_scale = float(least * np.cosh(np.clip(0.5 * (low + high) / (EARTH * least), -9.0, 9.0)))
+        if abs(map_scale - 1.0) > STRETCHED:
+            raise InputError(
+                f"{path}: coordinates are of a Mercator projection, whose metres are {map_scale:.2f} times as long "
+                f"here as on the ground: {remedy}"
+            )
     if abs(ratio * FOOT - 1.0) < 0.05:
         raise InputError(
             f"{path}: packet vectors are {ratio:.3f} times c/2 long, as in feet, but the CRS of the strip does not say "
@@ -343,11 +354,12 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
 
 
 def _measure_stretch(vectors: np.ndarray) -> float:
-    """How much longer vectors (n, 3) are across than upwards; 0 where that is 1 within STRETCHED, or not known.
+    """How much longer vectors (n, 3) are across than upwards; 0 where that is 1 within STRETCHED, or not known:
+    a few rays are rounded to any stretch.
 
     Light is as fast in all directions, so that the square across falls by 1 where that upwards grows by 1.
     """
-    if not len(vectors):
+    if len(vectors) < LEAST_RAYS:
         return 0.0
     up, across = vectors[:, 2] ** 2, vectors[:, 0] ** 2 + vectors[:, 1] ** 2
     off = up - np.mean(up)
@@ -356,8 +368,9 @@ def _measure_stretch(vectors: np.ndarray) -> float:
     left = across - np.mean(across) - slope * off
     # Vectors that are longer and shorter for another reason show nothing.
     exact = float(left @ left) < OFF_LINE * slope**2 * square and square > OFF_LINE**3 * float(up @ up)
-    stretch = max(-slope, 0.0) ** 0.5
-    return stretch if exact and stretch and abs(stretch - 1.0) > STRETCHED else 0.0
+    error, stretch = (float(left @ left) / max(square, 1e-300) / (len(left) - 2)) ** 0.5, max(-slope, 0.0) ** 0.5
+    sure = exact and abs(slope + 1.0) > SURE_TURN * error
+    return stretch if sure and abs(stretch - 1.0) > STRETCHED else 0.0
 
 
 def _look_like_degrees(reader: StripReader) -> bool:
