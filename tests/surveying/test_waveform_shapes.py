@@ -511,15 +511,18 @@ def test_what_goes_down_as_far_as_up_is_no_echo(kind):
         assert true > 0.99 and not doubts
 
 
-@pytest.mark.parametrize(("kind", "doubted"), [("leak", True), ("trigger", False), ("uneven", False), ("alone", False)])
-def test_echoes_at_one_sample_of_all_waveforms_are_doubted_where_only_noise_moves_them(kind, doubted):
+@pytest.mark.parametrize("kind", ["leak", "trigger", "uneven", "alone", "wide"])
+def test_echoes_at_one_sample_of_all_waveforms_are_doubted_where_only_noise_moves_them(kind):
     """A start pulse that leaks made 40 % of the echoes false, without a word. Even ground behind an echo trigger, a
-    start that differs from shot to shot, and a target that is alone, are no leak."""
+    start that differs from shot to shot, and a target that is alone, are no leak. Nor is it ground whose echoes are so
+    wide and weak that their times cannot show half a sample."""
     rng, n, x = np.random.default_rng(22), 1000, np.arange(120.0)
-    signal, rows, time, _ = render(bell, 22, n=n, s=120, amplitude=(10, 100), place=(0.4, 0.8))
-    moves = rng.uniform(-0.5, 0.5, (n, 1)) if kind == "trigger" else 0.0
+    wider, doubted = 3 if kind == "wide" else 1, kind == "leak"
+    signal, rows, time, _ = render(lambda z: bell(z / wider), 22, n=n, s=120, amplitude=(10, 100), place=(0.4, 0.8))
+    moves = rng.uniform(-0.5, 0.5, (n, 1)) if kind in ("trigger", "wide") else 0.0
     height = rng.uniform(8, 25, (n, 1)) if kind == "uneven" else 11 * (1 + 0.03 * rng.standard_normal((n, 1)))
-    fixed = height * bell((x - 15.3 - moves) / 2)
+    height = height / 2 if kind == "wide" else height
+    fixed = height * bell((x - 15.3 - moves) / 2 / wider)
     block = digitize((kind != "alone") * signal + fixed, 22, noise=1.0, base=60, top=4095)
     survey = survey_block(block)
     text = " ".join(one.text for one in doubt_survey(survey.system, survey.figures, n))
@@ -527,7 +530,7 @@ def test_echoes_at_one_sample_of_all_waveforms_are_doubted_where_only_noise_move
     assert ("% of the echoes in doubt" in text) == doubted and len(said) == doubted
     assert not doubted or said[0].startswith("50 % of the echoes stand at one sample")
     number = len(load_profile("accurate").run(block, survey.system))
-    assert number == pytest.approx(n if kind == "alone" else 2 * n, rel=0.01)
+    assert number == pytest.approx(n if kind == "alone" else 2 * n, rel=0.15 if kind == "wide" else 0.01)
 
 
 @pytest.mark.quick_cases("-9.0")

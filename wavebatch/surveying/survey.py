@@ -326,7 +326,7 @@ def _survey(
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
     if fixed_share:
         reason = f"{100 * fixed_share:.0f} % of the echoes stand at one sample of most waveforms and are as high: "
-        reason += "they are the receiver's, as a start pulse that leaks; leave them out"
+        reason += "they may be the receiver's, as a start pulse that leaks: look at some with `wavebatch plot waveform`"
         decisions = (*decisions, Decision("echoes at one sample", True, reason))
     if lowered:
         reason = f"noise is {system.noise.std:.2f} DN without them, {lowered:.2f} with them; the echoes found "

@@ -126,10 +126,11 @@ MOST_REPEATED, MOST_LACKED = 0.05, 0.016
 """Share of the echoes that may repeat beside stronger ones once a misfit covers what does: of real strips .03 do. And
 the largest misfit that does: more is a second target, as rows of crops have, and no error of six Gaussians."""
 
-MOST_HAVE, FIXED, ONE_PLACE, EQUAL = 0.5, 4.0, 1.2, 0.12
+MOST_HAVE, FIXED, ONE_PLACE, EQUAL, TRIGGERED = 0.5, 4.0, 1.2, 0.12, 12**-0.5
 """Share of the waveforms that have an echo at one sample, and at least one elsewhere, where the receiver makes the
 first; errors of a time by which these lie apart; and scatter of times and amplitudes over their errors that shows no
-target: behind a trigger it is 2.8 at an amplitude of 10 noises. And scatter of the amplitudes, as a share."""
+target: behind a trigger it is 2.8 at an amplitude of 10 noises. And scatter of the amplitudes, as a share; and of times
+behind a trigger [samples]."""
 
 LEAST_MISFIT, MOST_MISFIT, STEP_OF_MISFITS = 0.0005, 0.128, 2**0.5
 """Misfits of a pulse: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it is no pulse of this
@@ -296,7 +297,8 @@ def share_fixed(echoes: EchoTable, number: int, spacing: float) -> float:
     """Share of the echoes that stand at one sample of most waveforms, all of one height; 0 where these are the scene.
 
     The receiver makes them: a start pulse that leaks, a window before it. Noise alone moves them, so that times scatter
-    as their errors say, and amplitudes hardly more. First echoes behind a trigger move by half a sample too.
+    as their errors say, and amplitudes hardly more. Behind a trigger first echoes move by half a sample too: where
+    errors of times are so large that they hide it, as of wide or weak echoes, nothing tells them apart.
 
     Parameters
     ----------
@@ -314,6 +316,9 @@ def share_fixed(echoes: EchoTable, number: int, spacing: float) -> float:
         return 0.0
     first = int(np.argmax(many))
     here = (echoes.time >= ordered[first]) & (echoes.time <= ordered[int(after[first]) - 1])
+    moved = np.hypot(1, TRIGGERED * spacing / median(echoes.time_err[here]))
+    if moved < ONE_PLACE * (1 + SURE * MEDIAN_ERROR / np.sqrt(np.count_nonzero(here))):
+        return 0.0
     varies = np.hypot(echoes.amplitude_err, EQUAL * echoes.amplitude)
     for value, error in ((echoes.time, echoes.time_err), (echoes.amplitude, varies)):
         off = np.abs(value[here] - median(value[here])) / error[here]
