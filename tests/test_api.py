@@ -395,6 +395,8 @@ def test_read_cloud_reads_only_what_is_asked_for(clouds):
         wb.read_cloud(clouds[0] / "urban.laz", ["echo_wdth"])
     refuses(wb.InputError, "nothing.laz", wb.read_cloud, clouds[0] / "nothing.laz")
     refuses(wb.ConfigError, "columns: 1 is no name", wb.read_cloud, clouds[0] / "urban.laz", [1])
+    given = (name for name in ("z", "echo_width"))  # it had no column at all
+    assert wb.read_cloud(clouds[0] / "urban.laz", given).dtype.names == ("z", "echo_width")
 
 
 # Real data

@@ -346,6 +346,15 @@ def test_a_folder_loses_no_file_without_a_word(places, monkeypatch):
     monkeypatch.setattr(os, "walk", refuse)
     found = find_files([str(places)], recursive=True)
     assert found[0] == places / "sub" and [path.name for path in found[1:]] == ["a.LAZ", "away.las", "b.las", "far.las"]
+    lines = []
+    assert find_files([str(places)], recursive=True, note=lines.append) == found[1:]
+    said = f"{places}: 1 of its subfolders cannot be read, and their files are left out: {places / 'sub'}"
+    assert lines == [f"warning: {said}"]
+    done = run_command("check", "--recursive", "--quiet", places)
+    assert said in done.stderr and f"{places / 'sub'}: " not in done.stdout
+    for path in found[1:]:
+        path.unlink()
+    assert find_files([str(places)], recursive=True, note=lines.append) == found[:1] and len(lines) == 1
 
 
 def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(places):

@@ -265,13 +265,17 @@ def write_html(target: Path | None, of: str, parts: Iterable[Part]) -> None:
 
 
 def find_inputs(arguments: Iterable[Path | str], **how: Any) -> list[Path]:
-    """The files of the arguments, as `find_files` finds them; a link to a file that was given before is named."""
+    """The files of the arguments, as `find_files` finds them; a link to a file that was given before is named,
+    and so are subfolders that cannot be read."""
     return find_files(map(str, arguments), note=note_input, **how)
 
 
 def note_input(line: str) -> None:
-    """A line about the arguments."""
-    tell(f"note: {line}")
+    """A line about the arguments; a warning is said with --quiet, too."""
+    if line.startswith("warning: "):
+        talk(line)
+    else:
+        tell(f"note: {line}")
 
 
 INPUT = click.Path(path_type=Path, readable=False)

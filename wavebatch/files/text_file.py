@@ -97,6 +97,9 @@ def draft_text(path: Path, text: str, *, overwrite: bool) -> Draft:
 
 SUFFIXES = (".las", ".laz")
 
+MOST_NAMED = 5
+"""Subfolders that a line names."""
+
 LONGEST_PATTERN = 4096
 """Characters of a pattern: a longer one is taken as a name, which no file can have. 100,000 brackets took minutes."""
 
@@ -114,16 +117,18 @@ def find_files(
     and not of links to folders, which may lead in a circle.
     `@list.txt` holds one argument per line, relative to the folder of the list; empty lines and lines that start with #
     are skipped. `@-` is a list from stdin. A file that does not exist or a folder that cannot be read is kept: it fails
-    in its turn, so that the other files are still processed.
+    in its turn, so that the other files are still processed. Subfolders that cannot be read, such as `lost+found` of a
+    disk, are noted only, where there are other files.
     kinds: suffixes of the files that folders and patterns give, kind after kind: the first that is there is taken.
-    note: is called with a line about each link to a file that was given before.
+    note: is called with a line about each link to a file that was given before, and about subfolders that cannot be
+    read: without it they are kept.
     Raises ConfigError if a folder, pattern or list gives no file, or if there is no argument.
     """
     files: dict[str, Path] = {}
     for argument in arguments:
         if not argument:  # pathlib takes it for the current folder
             raise ConfigError("the name of a file is empty")
-        for path in _expand(argument, Path(), recursive, kinds):
+        for path in _expand(argument, Path(), recursive, kinds, note):
             first = files.setdefault(real_name(path), path)
             if note is not None and os.path.abspath(first) != os.path.abspath(path):
                 note(f"{path}: is the same file as {first}; it is used once")
@@ -150,7 +155,9 @@ def find_strips(
     return strips
 
 
-def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:
+def _expand(
+    argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequence[str]], note: Callable[[str], None] | None
+) -> Iterator[Path]:
     if argument.startswith("@"):
         path, empty = Path("/dev/stdin") if argument == "@-" else folder / argument[1:], True
         # A list from a pipe lies in no folder: its names are seen from where the command runs.
@@ -162,7 +169,7 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
                 if entry.startswith("@"):
                     raise ConfigError(f"{path}: line {number}: a list cannot name another list")
                 empty = False
-                yield from _expand(entry, beside, recursive, kinds)
+                yield from _expand(entry, beside, recursive, kinds, note)
         if empty:
             raise ConfigError(f"{path}: the list names no file; write one file, folder or pattern per line")
         return
@@ -170,7 +177,7 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
     if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
         with contextlib.suppress(ValueError):  # no user can have this name
             path = folder / os.path.expanduser(argument)
-    closed: list[str] = []  # folders that cannot be read: they fail in their turn
+    closed: list[str] = []  # subfolders that cannot be read
     if os.path.isdir(path):
         try:
             names = _walk(path, closed) if recursive else os.listdir(path)
@@ -183,15 +190,21 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
         return
     else:
         found, problem = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))], f"{argument}: matches"
-    yield from map(Path, closed)
     for suffixes in kinds:
         # A link to nothing fails in its turn: the disk that it leads to may be missing.
         chosen = [entry for entry in found if entry.suffix.lower() in suffixes and not entry.name.startswith(".")
                   and (os.path.isfile(entry) or not os.path.exists(entry))]  # fmt: skip
+        if chosen and note is not None and closed:
+            note(
+                f"warning: {path}: {len(closed)} of its subfolders cannot be read, and their files are left out: "
+                f"{', '.join(sorted(closed)[:MOST_NAMED])}{', ...' * (len(closed) > MOST_NAMED)}"
+            )
+            closed = []
         if chosen:
-            yield from chosen
+            yield from (*map(Path, closed), *chosen)
             return
     if closed:
+        yield from map(Path, closed)
         return
     *names, last = [suffix for suffixes in kinds for suffix in suffixes]
     hint = "; --recursive takes those of its subfolders too" if os.path.isdir(path) and not recursive else ""

@@ -374,7 +374,7 @@ class _TableReader(ColumnReader):
         names = {axis: axis for axis in "xyz"}
         names |= {name: name for name in known if name not in names and name not in self.extra}
         names |= {ours.get(field, field): field for field in self.extra}
-        chosen = names if columns is None else columns
+        chosen = list(names if columns is None else columns)  # a generator gives them once
         with undoing(self.close):
             if wrong := [name for name in chosen if not isinstance(name, str)]:
                 raise ConfigError(f"columns: {wrong[0]!r} is no name; give texts, such as 'amplitude'")
