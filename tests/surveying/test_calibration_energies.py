@@ -208,3 +208,4 @@ def test_a_gain_that_follows_the_light_is_named_without_a_calibration(tmp_path):
     strip = write_strip(tmp_path / "s.las", FARMLAND, Sensor(**BASE, light=LIGHT), 12_000, seed=8, receive=follow)
     done = call("run", strip, "-o", tmp_path / "out", "--columns", "+amplitude_normalized")
     assert done.exit_code == 0 and "the gain of the receiver follows the light" in done.stderr
+    assert "and none of amplitudes" in done.stderr and "errors of calibrated values hold" not in done.stderr

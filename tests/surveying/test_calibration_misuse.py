@@ -845,7 +845,7 @@ def test_vectors_that_are_turned_in_a_part_of_the_strip_are_in_the_errors_of_ang
     own, (one, other) = {}, ((1, 2), (0, 2))[axis]
 
     def turn_rays(stored):
-        own["true"] = np.degrees(np.arccos(-stored.ray[:, 2]))
+        own["true"], own["hit"] = np.degrees(np.arccos(-stored.ray[:, 2])), stored.hit
         ray, angle = stored.ray.copy(), np.radians(turn) * (np.abs(np.arange(len(stored.ray)) / 20_000 - 0.5) < 0.17)
         ray[:, one] = stored.ray[:, one] * np.cos(angle) - stored.ray[:, other] * np.sin(angle)
         ray[:, other] = stored.ray[:, one] * np.sin(angle) + stored.ray[:, other] * np.cos(angle)
@@ -853,12 +853,16 @@ def test_vectors_that_are_turned_in_a_part_of_the_strip_are_in_the_errors_of_ang
 
     long = Sensor(speed=30.0, rate=4000.0, line_rate=20.0, half_angle=12.0, light=LIGHT)
     write_strip(tmp_path / "s.las", [Facet(0.3)], long, 20_000, seed=62, store=turn_rays)
-    done = succeed("run", tmp_path / "s.las", "-o", tmp_path / "out", "--columns", "+incidence_angle_normals")
+    columns = "+incidence_angle_normals,+range,+range_error"
+    done = succeed("run", tmp_path / "s.las", "-o", tmp_path / "out", "--columns", columns)
     assert ("turned against the points by up to" in done.stderr) == bool(turn)
+    assert "e+0" not in done.stderr  # 1e+01 degrees, 2e+02 cm
     cloud = wb.read_cloud(tmp_path / "out" / "s.laz")
     pulse = np.rint((cloud["gps_time"] - START) * 4000.0).astype(int)
     off, stated = cloud["incidence_angle_normals"] - own["true"][pulse], cloud["incidence_angle_normals_err"]
     assert np.mean(np.abs(off) < stated) > 0.95 and np.nanmedian(stated) < (5.0 if turn else 0.15)
+    wrong = np.abs(cloud["range"] - own["hit"][pulse])
+    assert np.mean(wrong < 1.5 * cloud["range_error"]) > 0.95
 
 
 def sensor_of(time):

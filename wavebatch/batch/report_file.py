@@ -359,7 +359,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...]
     if second is not None and "incidence_angle_normals" in second.stage.makes and unseen > UNSEEN_TURN:
         lines.append(
             "incidence_angle_normals: this strip does not show well whether its packet vectors are turned against the "
-            f"points: the errors hold {sensor.turned:.1g} degrees of it; --trajectory would show it"
+            f"points: the errors hold {float(f'{sensor.turned:.1g}'):g} degrees of it; --trajectory would show it"
         )
     system = prepared.system
     errors = {"hidden_light": "amplitudes and energies", "hidden_width": "widths"}

@@ -220,23 +220,24 @@ class SensorSource:
         if self.height and facts.get("relief_m", 0.0) > HEIGHT_ERROR * self.height:
             return (
                 f"range: --flight-height is one number, but heights scatter by {facts['relief_m']:.0f} m: the "
-                f"error of the ranges, {self.error:.2g} m, holds it; give --trajectory"
+                f"error of the ranges, {float(f'{self.error:.2g}'):g} m, holds it; give --trajectory"
             )
         if facts.get("is_turned"):
             off, error = facts["turned_deg"], facts["turned_error_deg"]
-            size = f"{off:.2g} degrees, known to {error:.1g}" if off > error else f"up to {off + error:.1g} degrees"
+            shown, known, most = (f"{float(f'{value:.2g}'):g}" for value in (off, error, off + error))
+            size = f"{shown} degrees, known to {known}" if off > error else f"up to {most} degrees"
             off += error * (off <= error)
             return (
                 f"angles: the packets' vectors are turned against the points by {size}: echoes 10 m from a return are "
-                f"{1000 * np.radians(off):.1g} cm off, and the errors of angles and ranges hold "
-                "it; compute points and vectors with the same mounting"
+                f"{float(f'{1000 * np.radians(off):.1g}'):g} cm off, and the errors of angles and of ranges "
+                "(range_error) hold it; compute points and vectors with the same mounting"
             )
         late, behind = (facts.get(name) or 0.0 for name in ("late_s", "behind_m"))
         if abs(behind) > max(MOUNTING * (self.distance or 0.0), 10.0 * (self.vectors_error or 0.0)):
             return (
                 f"range: the trajectory is {abs(behind):.1f} m {'behind' if late > 0 else 'ahead of'} the packets' "
                 f"vectors, as if its clock were off by {late:+.2f} s: check its clock and lever arm; the error of the "
-                f"ranges, {self.error:.2g} m, holds it"
+                f"ranges, {float(f'{self.error:.2g}'):g} m, holds it"
             )
         if self.farther is None or abs(self.farther) <= max(LEAST_DOUBT, 5.0 * (self.vectors_error or 0.0)):
             return ""

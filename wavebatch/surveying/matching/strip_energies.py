@@ -172,8 +172,8 @@ def take_energies(
     if follows:
         notes.append(
             "the gain of the receiver follows the light of the last pulses, or packets were scaled one by one: light "
-            f"varies by {100 * follows:.0f} % by it, which errors of calibrated values hold; give the gain of each "
-            "pulse as --energy"
+            f"varies by it: {100 * follows:.0f} % of error of calibrated values, and none of amplitudes, though both "
+            "may be off by more; give the gain of each pulse as --energy"
         )
         growth = math.hypot(growth, follows)
     if apart:
