@@ -394,8 +394,8 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     Notes
     -----
     Neighbours differ in lag and share from echo to echo. A part of the pulse is found with every echo that is so strong
-    that it must be, unless another echo is in its place (docs/algorithms.md R3). If its share varies, it is no tail
-    either, whatever samples show.
+    that it must be, unless another echo is in its place (docs/algorithms.md R3). What varies, and has a share above
+    FAINT, is no part, and no tail either, whatever samples show.
     """
     ref = system.sigma_ref
     found = SURELY * system.noise.std / float(np.sqrt(filter_energy(gaussian_taps(ref / block.spacing))))
