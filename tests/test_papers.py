@@ -5,11 +5,15 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from html_tools import Page
+
+from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.tools.simulate import DiscreteReceiver
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
 README = FOLDER / "README.md"
@@ -110,6 +114,54 @@ def test_the_paper_column_has_what_is_printed(load):
     assert counts["maxima: 1"] == "58.08, 51.54" and counts["ASDF, mean pulse: 5 or more"] == "0.24, 0.27"
     models = {row[0]: row[1] for row in load("s1_wang").table_of_models(20, 0).rows}
     assert models["table 3: Leica, mean of both classes, log-normal"] == "0.0083"
+
+
+def raise_echoes(s4, monkeypatch):
+    """Echoes of `synthesize` are .5 % too high."""
+
+    def raised(*known):
+        found = gaussian(*known)
+        return replace(found, amplitude=found.amplitude * np.float32(1.005))
+
+    monkeypatch.setattr(s4, "gaussian", raised)
+    return s4.table_of_synthesis(3000, 0)
+
+
+def add_energy(s4, monkeypatch):
+    """Waveforms of `synthesize` have 3 % too much energy."""
+    made = s4.synthesize_strip
+
+    def synthesize_more(cloud, strip, options, **known):
+        return made(cloud, strip, replace(options, gain=1.03 * options.gain), **known)
+
+    monkeypatch.setattr(s4, "synthesize_strip", synthesize_more)
+    return s4.table_of_footprints(3000, 0)
+
+
+def blind_longer(s4, monkeypatch):
+    """The receiver is blind for 3 mm more."""
+    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone + 0.003))
+    return s4.table_of_separations(s4.FULL, 0)
+
+
+def add_return(s4, monkeypatch):
+    """The receiver gives a fifth return."""
+    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone, most=5))
+    return s4.table_of_numbers(s4.FULL, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "failures"),
+    [
+        (raise_echoes, {"height of lone echoes over gain times intensity"}),
+        (add_energy, {"pulses of 1, shares of 1/1", "pulses of 2, shares of 1/2"}),
+        (blind_longer, {"0.64 m, least of 2-3", "0.67 m, least of 1-2"}),
+        (add_return, {"orion-20 m, numbers above 4", "gemini-24 m, numbers above 4"}),
+    ],
+)
+def test_small_faults_are_not_accepted(fault, failures, load, monkeypatch):
+    assert failures <= set(fault(load("s4_ussyshkin"), monkeypatch).failures)
 
 
 def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):

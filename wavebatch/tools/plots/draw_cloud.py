@@ -240,8 +240,8 @@ MARKERS = "os^Dv*"
 MOST_TOGETHER = 6
 """Most series in one axes: more lines cannot be followed."""
 
-FEWEST_IN_LINE = 5
-"""Series of fewer values are points: two values make a line of two needles."""
+FEWEST_IN_LINE = FEWEST
+"""Series of fewer values than bins are points: each value would be a needle of a line."""
 
 _NARROW = 4.0
 """Maps so many times as high as wide have a separate place for the scale of colours: it would shrink with them."""
