@@ -124,7 +124,7 @@ static int grow_window(const Settings *s, const Limits *limits, const Prior *wid
         missed = misses_echoes(s, work, work->fit.cost, fall);
         if (!(work->fit.converged || missed) || !may_grow(s, &work->window) || k >= s->max_echoes) return 0;
         if (s->whitened) whitened_moments(s, work, &work->fit);
-        else hermite_moments(s, work, &work->fit);
+        else hermite_moments(work, &work->fit);
         if (!(s->whitened ? is_whitened_misfit : is_misfit)(s, work, &work->fit)) return 0;
         if (!reserve(work, k + 1, work->window.vectors)) return -1;
         double promise = propose_echo(s, work, &work->fit, limits, &work->next);
@@ -203,7 +203,7 @@ static void renew_errors(const Settings *s, const Prior *prior, Work *work) {
     work->fit.prior = *prior;
     memcpy(work->fit.parameters, best->parameters, per * k * sizeof(double));
     evaluate_rows(k, per, s, work, best->parameters);
-    multiply_rows(per * k + 1, work->window.vectors, work->rows, work->fit.gram);
+    find_products(per * k + 1, work, work->fit.gram);
     add_prior(k, per, prior, work->window.std, best->parameters, work->fit.gram);
     FOR_EACH_NUMBER(find_errors, work, best);
 }
@@ -335,9 +335,10 @@ EXPORT int64_t promise_echoes(const Block *block, const Clusters *clusters, cons
         memcpy(work.fit.parameters, work.next.parameters, 3 * k * sizeof(double));
         work.fit.k = k; work.fit.per = 3;
         evaluate_rows(k, 3, s, &work, work.fit.parameters);
-        multiply_rows(3 * k + 1, work.window.vectors, work.rows, work.fit.gram);
+        find_products(3 * k + 1, &work, work.fit.gram);
+        take_level_off(&work.window, 1, work.rows + 3 * k * work.window.vectors);
         if (s->whitened) { find_new_energy(&work); whitened_moments(s, &work, &work.fit); }
-        else hermite_moments(s, &work, &work.fit);
+        else hermite_moments(&work, &work.fit);
         promise[i] = propose_echo(s, &work, &work.fit, &limits, &work.next);
     }
     free_work(&work);

@@ -79,12 +79,6 @@ static void innovate(const Described *w, lanes *row, int64_t vectors) {
     row[0] = (row[0] - last * one - before * two) * scale;
 }
 
-static double dot(const lanes *a, const lanes *b, int64_t vectors) {
-    lanes sum = ALL(0);
-    for (int64_t v = 0; v < vectors; v++) sum += a[v] * b[v];
-    return sum_lanes(sum);
-}
-
 /* Rows of an echo at the positions x: pulse, and derivatives by time and width. */
 static void draw_echo(const Described *w, int64_t echo, const lanes *x, int64_t vectors, lanes *rows) {
     Echo one = {1, w->time[echo], w->width[echo], 0};
@@ -135,7 +129,7 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
     factor(p, d->matrix, d->pivot, 0.1 * NEARLY_SINGULAR);
     for (int64_t r = 0; r < p; r++) {
         for (int64_t c = 0; c < p; c++) d->column[c] = c == r;
-        solve(p, d->matrix, d->pivot, d->column);
+        solve(p, d->matrix, d->column);
         sum += 0.5 * (log_double(fmax(d->column[r], 1)) + log_double(fmin(d->pivot[r], 2)));
     }
     return sum;
@@ -159,10 +153,10 @@ static void find_bend(const Described *w, Desk *d, int64_t echo, Bend *bend) {
     for (int64_t r = 0; r < 5; r++) {
         lanes *row = d->modes + r * vectors;
         for (int64_t b = 0; b < r; b++) {
-            const float share = dot(row, d->modes + b * vectors, vectors);
+            const float share = multiply(vectors, row, d->modes + b * vectors);
             for (int64_t v = 0; v < vectors; v++) row[v] -= d->modes[b * vectors + v] * share;
         }
-        double norm = sqrt(dot(row, row, vectors));
+        double norm = sqrt(multiply(vectors, row, row));
         if (!r) energy = norm;
         for (int64_t v = 0; v < vectors; v++) row[v] *= (float)(1 / fmax(norm, 1e-9));
     }
@@ -170,13 +164,13 @@ static void find_bend(const Described *w, Desk *d, int64_t echo, Bend *bend) {
         lanes *row = bend->rows + r * vectors;
         for (int64_t v = 0; v < vectors; v++) row[v] = d->modes[(3 + r) * vectors + v] * (weight[v] * (float)(energy * w->amplitude[echo]));
         innovate(w, row, vectors);
-        bend->energy[r] = dot(row, row, vectors);
+        bend->energy[r] = multiply(vectors, row, row);
     }
 }
 
 /* Height of a direction in what is left, where a change of the pulse from shot to shot makes so much likely. */
 static double find_height(const Bend *bend, int64_t r, const lanes *rest, double change) {
-    return dot(bend->rows + r * bend->vectors, rest + bend->from, bend->vectors) / (bend->energy[r] + 1 / (change * change));
+    return multiply(bend->vectors, bend->rows + r * bend->vectors, rest + bend->from) / (bend->energy[r] + 1 / (change * change));
 }
 
 /* Takes a change of an echo's shape off what is left, as far as it is likely, and returns what it costs. */

@@ -26,7 +26,7 @@ EXPORT int64_t solve_equations(int64_t n, int64_t m, double *matrix, double *rig
     double *pivot = malloc((n + 1) * sizeof(double));
     if (!pivot) return -1;
     factor(n, matrix, pivot, 0);
-    for (int64_t i = 0; i < m; i++) solve(n, matrix, pivot, right + i * n);
+    for (int64_t i = 0; i < m; i++) solve(n, matrix, right + i * n);
     free(pivot);
     return 0;
 }
@@ -92,7 +92,7 @@ EXPORT int64_t fit_factors(int64_t s, const double *joint, double amplitude_by_w
     factor(3, matrix, pivot, 0);
     for (int64_t j = 0; j < n; j++) {
         double one[3] = {seen[j], seen[n + j], seen[2 * n + j]};
-        solve(3, matrix, pivot, one);
+        solve(3, matrix, one);
         whole[3 * n + j] = one[0] + one[2];    /* of the energy: amplitude and width change by the same share */
         whole[j] = one[0] + amplitude_by_width * one[2];
         whole[n + j] = one[1] + time_by_width * one[2];

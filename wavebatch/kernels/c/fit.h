@@ -36,7 +36,8 @@ static void log_normal(double origin, const Echo *echo, const Window *w, lanes *
     }
 }
 
-/* The rows of the model: pulses, derivatives, residual. Clipped samples count only where the model lies below them. */
+/* The rows of the model: pulses, derivatives, residual. Clipped samples count only where the model lies below them. Levels
+   are still in them: `find_products` takes them off the products, which is less work. */
 INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work, const double *p) {
     const Window *w = &work->window;
     const int64_t n = w->vectors;
@@ -56,7 +57,6 @@ INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work,
         for (int64_t i = 0; i <= per * k; i++) work->rows[i * n + v] *= weight;
     }
     for (int64_t i = 0; i <= per * k && w->is_whitened; i++) whiten(w, work->rows + i * n);
-    for (int64_t i = 0; i <= per * k && w->level_share > 0; i++) take_level_off(w, work->rows + i * n);
 }
 
 /* The same to the same bits where rows are long: a sum waits for each of its additions, so there are eight at a time. */
@@ -93,6 +93,18 @@ INLINE void multiply_rows(int64_t rows, int64_t vectors, const lanes *row, doubl
         }
 }
 
+/* Inner products of the rows as `take_level_off` would leave them: (I - l l')^2 = I - (2 - l'l) l l'. */
+INLINE void find_products(int64_t rows, Work *work, double *gram) {
+    const Window *w = &work->window;
+    multiply_rows(rows, w->vectors, work->rows, gram);
+    for (int64_t i = 0; i < rows && w->level_share > 0; i++) {
+        const double *restrict along = work->along, share = (2 - w->level_share) * multiply(w->vectors, work->rows + i * w->vectors, w->level);
+        double *restrict row = gram + i * rows;
+        work->along[i] = share / (2 - w->level_share);
+        for (int64_t j = 0; j <= i; j++) row[j] -= share * along[j];
+    }
+}
+
 /* Adds to the products what is known of widths (H1) and skews (1.2) before the fit; the cost of that. */
 INLINE double add_prior(int64_t k, int64_t per, const Prior *prior, double std, const double *p, double *gram) {
     const int64_t rows = per * k + 1;
@@ -118,34 +130,35 @@ INLINE double add_prior(int64_t k, int64_t per, const Prior *prior, double std, 
     return cost;
 }
 
-/* matrix = L D L', in place: L below the diagonal, D in pivot. Pivots up to `least` are as if infinite. */
+/* matrix = L D L', in place, from what is below its diagonal: L there, D L' above it, 1 / D on it; D in pivot. Pivots up to
+   `least` are as if infinite. Loops run along rows, and divide once for each: to wait for numbers is most of their time. */
 INLINE void factor(int64_t n, double *matrix, double *pivot, double least) {
     for (int64_t j = 0; j < n; j++) {
-        pivot[j] = matrix[j * n + j] > least ? matrix[j * n + j] : UNDETERMINED;
+        double *restrict column = matrix + j * n;
+        pivot[j] = column[j] > least ? column[j] : UNDETERMINED;
+        column[j] = 1 / pivot[j];
         for (int64_t i = j + 1; i < n; i++) {
-            double share = matrix[i * n + j] / pivot[j];
-            for (int64_t m = j + 1; m <= i; m++) matrix[i * n + m] -= share * matrix[m * n + j];
+            double *restrict row = matrix + i * n;
+            column[i] = row[j];
+            row[j] *= column[j];
+            for (int64_t m = j + 1; m <= i; m++) row[m] -= row[j] * column[m];
         }
-        for (int64_t i = j + 1; i < n; i++) matrix[i * n + j] /= pivot[j];
     }
 }
 
-/* Solves the equations for a right side of zeros before row `from`, down to row `to` of the solution; above it is no result. */
-INLINE void solve_part(int64_t n, const double *lower, const double *pivot, double *right, int64_t from, int64_t to) {
-    for (int64_t i = from + 1; i < n; i++) {
-        double value = right[i];
-        for (int64_t j = from; j < i; j++) value -= lower[i * n + j] * right[j];
-        right[i] = value;
+/* Solves the equations that `factor` left for a right side of zeros before row `from`, down to row `to` of the solution;
+   above it is no result. */
+INLINE void solve_part(int64_t n, const double *factors, double *restrict right, int64_t from, int64_t to) {
+    for (int64_t j = from; j < n; j++) {
+        const double *restrict row = factors + j * n, share = right[j] * row[j];
+        for (int64_t i = j + 1; i < n; i++) right[i] -= row[i] * share;
+        right[j] = share;
     }
-    for (int64_t i = from; i < n; i++) right[i] /= pivot[i];
-    for (int64_t i = n - 1; i >= to; i--) {
-        double value = right[i];
-        for (int64_t j = i + 1; j < n; j++) value -= lower[j * n + i] * right[j];
-        right[i] = value;
-    }
+    for (int64_t i = n - 1; i > to; i--)
+        for (int64_t j = to; j < i; j++) right[j] -= factors[i * n + j] * right[i];
 }
 
-INLINE void solve(int64_t n, const double *lower, const double *pivot, double *right) { solve_part(n, lower, pivot, right, 0, 0); }
+INLINE void solve(int64_t n, const double *factors, double *right) { solve_part(n, factors, right, 0, 0); }
 
 /* What one unit of a row's coefficient means: 1 for amplitudes, width / amplitude for times and widths, 1 / amplitude
    for skews. Amplitudes below half of the noise count as that. */
@@ -160,17 +173,20 @@ INLINE double find_step(int64_t k, int64_t per, Work *work, const double *p, con
     const int64_t n = per * k, rows = n + 1;
     const double *slope = gram + n * rows;
     double promise = 0;
+    int any_frozen = 0;
     for (int64_t i = 0; i < n; i++) {
         int64_t kind = i / k;
         work->frozen[i] = (p[i] <= limits->low[kind] && slope[i] < 0) || (p[i] >= limits->high[kind] && slope[i] > 0);
+        any_frozen |= work->frozen[i];
     }
     for (int64_t i = 0; i < n; i++) {
-        for (int64_t j = 0; j <= i; j++) work->matrix[i * n + j] = work->frozen[i] || work->frozen[j] ? 0 : gram[i * rows + j];
+        for (int64_t j = 0; j <= i; j++)
+            work->matrix[i * n + j] = any_frozen && (work->frozen[i] || work->frozen[j]) ? 0 : gram[i * rows + j];
         work->matrix[i * n + i] = work->matrix[i * n + i] * (1 + damping) + RIDGE;
         work->step[i] = work->frozen[i] ? 0 : slope[i];
     }
     factor(n, work->matrix, work->pivot, 1e-300);
-    solve(n, work->matrix, work->pivot, work->step);
+    solve(n, work->matrix, work->step);
     for (int64_t i = 0; i < n; i++) promise += work->frozen[i] ? 0 : work->step[i] * slope[i];
     return promise;
 }
@@ -205,7 +221,7 @@ INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *
     fit->cost = INFINITY; fit->converged = fit->hopeless = 0;
     for (int64_t iteration = 0;; iteration++) {
         evaluate_rows(k, per, s, work, trial);
-        multiply_rows(rows, work->window.vectors, work->rows, work->products);
+        find_products(rows, work, work->products);
         double cost = work->products[n * rows + n] + add_prior(k, per, &fit->prior, std, trial, work->products), before = fit->cost;
         int accepted = iteration == 0 || cost <= fit->cost * (1 + 1e-6);
         if (iteration) damping = fmax(damping * (!accepted ? raise : fit->cost - cost > KEPT * promised ? EASE : 1), 1e-7);
@@ -228,7 +244,7 @@ INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *
         fit->cost /= variance;
         if (fit->converged) return;
         evaluate_rows(k, per, s, work, fit->parameters); /* the rows are those of a step that was refused */
-        multiply_rows(rows, work->window.vectors, work->rows, fit->gram);
+        find_products(rows, work, fit->gram);
         add_prior(k, per, &fit->prior, std, fit->parameters, fit->gram);
         return;
     }
@@ -247,7 +263,7 @@ static void fit_undamped(int64_t k, const Settings *s, const Limits *limits, Wor
     int is_sane = 1;
     for (int64_t iteration = 0; iteration < s->max_iterations && is_sane && !fit->converged; iteration++) {
         evaluate_rows(k, 3, s, work, p);
-        multiply_rows(rows, work->window.vectors, work->rows, fit->gram);
+        find_products(rows, work, fit->gram);
         double promise = find_step(k, 3, work, p, fit->gram, &none, 0);
         for (int64_t i = 0; i < n; i++) work->step[i] *= unit_of(k, i, p, std);
         for (int64_t i = 0; i < n; i++) p[i] += work->step[i];
@@ -259,7 +275,7 @@ static void fit_undamped(int64_t k, const Settings *s, const Limits *limits, Wor
     if (!is_sane) memcpy(p, start, n * sizeof(double));
     for (int64_t j = 2 * k; j < n; j++) p[j] = fmin(fmax(p[j], limits->low[2]), limits->high[2]);
     evaluate_rows(k, 3, s, work, p);
-    multiply_rows(rows, work->window.vectors, work->rows, fit->gram);
+    find_products(rows, work, fit->gram);
     fit->cost = fit->gram[n * rows + n] / (std * std);
 }
 
@@ -276,7 +292,7 @@ INLINE int invert(int64_t k, int64_t per, Work *work, const double *gram, double
     for (int64_t c = 0; c < n; c++) {
         memset(column, 0, n * sizeof(double));
         column[c] = 1;
-        solve_part(n, matrix, work->pivot, column, c, c / k == 2 ? c - 2 * k : c);
+        solve_part(n, matrix, column, c, c / k == 2 ? c - 2 * k : c);
         variance[c] = column[c];
         is_flat &= column[c] * gram[c * rows + c] < STEEP && column[c] > 0;
         if (c / k == 2) { shared[c - 2 * k] = column[c - 2 * k]; shared[c - k] = column[c - k]; }
@@ -286,16 +302,15 @@ INLINE int invert(int64_t k, int64_t per, Work *work, const double *gram, double
 
 /* One standard deviation of each parameter and the covariances of widths, in float64 where echoes overlap much. */
 INLINE void find_errors(int64_t k, int64_t per, Work *work, Solution *out) {
-    const int64_t n = per * k, rows = n + 1, samples = work->window.vectors * LANES;
+    const int64_t n = per * k, rows = n + 1, vectors = work->window.vectors;
     const double *p = work->fit.parameters, std = work->window.std;
     if (!invert(k, per, work, work->fit.gram, out->errors, out->shared)) {
-        const float *row = (const float *)work->rows;
-        for (int64_t i = 0; i < n; i++)
-            for (int64_t j = 0; j <= i; j++) {
-                double sum = 0;
-                for (int64_t x = 0; x < samples; x++) sum += (double)row[i * samples + x] * row[j * samples + x];
-                work->products[i * rows + j] = sum;
-            }
+        for (int64_t i = 0; i < n; i++) {
+            work->along[i] = work->window.level_share > 0 ? multiply_wide(vectors, work->rows + i * vectors, work->window.level) : 0;
+            for (int64_t j = 0; j <= i; j++)
+                work->products[i * rows + j] = multiply_wide(vectors, work->rows + i * vectors, work->rows + j * vectors)
+                    - (2 - work->window.level_share) * work->along[i] * work->along[j];
+        }
         add_prior(k, per, &work->fit.prior, std, p, work->products);
         invert(k, per, work, work->products, out->errors, out->shared);
     }
@@ -316,25 +331,31 @@ static void fit_window(int64_t k, int64_t per, const Settings *s, const Limits *
 static const double NEAR = 4;                  /* widths of the pulse from an echo up to which what its fit leaves counts */
 
 /* Root mean square residual in noise about each echo; that of its window where it is alone. */
-static void measure_misfits(const Settings *s, const Work *work, double *misfit) {
-    const int64_t k = work->fit.k, per = work->fit.per;
+static void measure_misfits(const Work *work, double reach, double *misfit) {
+    const int64_t k = work->fit.k, n = work->fit.per * k;
     const Window *w = &work->window;
-    const float *residual = (const float *)(work->rows + per * k * w->vectors), *x = (const float *)w->x;
-    for (int64_t j = 0; j < k; j++) {
-        const double time = work->fit.parameters[k + j], reach = k > 1 ? NEAR * s->width_ref : INFINITY;
-        double squares = 0;
-        int64_t used = 0;
-        for (int64_t i = 0; i < w->n; i++)
-            if (fabs(x[i] - time) <= reach && x[i] >= 0) { squares += (double)residual[i] * residual[i]; used++; }
-        misfit[j] = sqrt(squares / (used > 0 ? used : 1)) / w->std;
+    const lanes *residual = work->rows + n * w->vectors;
+    if (k == 1) misfit[0] = sqrt(work->fit.gram[n * (n + 1) + n] / (w->used > 0 ? w->used : 1)) / w->std;
+    for (int64_t j = 0; j < k && k > 1; j++) {
+        const float time = work->fit.parameters[k + j];
+        lanes squares = ALL(0), used = ALL(0);
+        for (int64_t v = 0; v < w->vectors; v++) {
+            const lanes away = w->x[v] - time;
+            const lane_bits near = (away <= (float)reach) & (away >= (float)-reach) & (w->x[v] >= 0.f);
+            squares += pick(near, residual[v] * residual[v], ALL(0));
+            used += pick(near, ALL(1), ALL(0));
+        }
+        misfit[j] = sqrt(sum_lanes(squares) / at_least(sum_lanes(used), 1)) / w->std;
     }
 }
 
-/* The fit as a solution: errors, what is left of each echo, parameters that lie on their limits. */
+/* The fit as a solution: errors, what is left of each echo, parameters that lie on their limits. The level is taken off the
+   residual, not off the other rows. */
 static void describe_fit(const Settings *s, const Limits *limits, Work *work, Solution *out) {
     const int64_t k = work->fit.k, per = work->fit.per;
     FOR_EACH_NUMBER(find_errors, work, out);
-    measure_misfits(s, work, out->misfit);
+    take_level_off(&work->window, 1, work->rows + per * k * work->window.vectors);
+    measure_misfits(work, NEAR * s->width_ref, out->misfit);
     out->k = k; out->per = per; out->converged = work->fit.converged; out->cost = work->fit.cost;
     memcpy(out->parameters, work->fit.parameters, per * k * sizeof(double));
     memset(out->at_bound, 0, k);

@@ -29,6 +29,19 @@ INLINE double at_most(double value, double bound) { return value < bound ? value
 
 INLINE float sum_lanes(lanes v) { return (v[0] + v[2]) + (v[1] + v[3]); }
 
+/* The inner product of n vectors; once in float32, once in float64. */
+INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
+    lanes sum = ALL(0);
+    for (int64_t v = 0; v < n; v++) sum += a[v] * b[v];
+    return sum_lanes(sum);
+}
+
+INLINE double multiply_wide(int64_t n, const lanes *a, const lanes *b) {
+    wide sum = {0};
+    for (int64_t v = 0; v < n; v++) sum += __builtin_convertvector(a[v], wide) * __builtin_convertvector(b[v], wide);
+    return (sum[0] + sum[2]) + (sum[1] + sum[3]);
+}
+
 /* ln a for a > 0, error 1e-7: a = 2^n m with m near 1, ln m = 2 atanh((m - 1) / (m + 1)) as its series. */
 INLINE lanes log_lanes(lanes a) {
     lane_bits bits = (lane_bits)a - 0x3f3504f3, n = bits >> 23; /* from the root of 1/2 on */

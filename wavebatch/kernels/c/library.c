@@ -11,9 +11,16 @@
 #include "pulse.h"
 #include "work.h"
 #include "window.h"
+#if defined(__GNUC__) && !defined(__clang__) /* loops over the few unknowns of a fit end before vectors of theirs would pay */
+#pragma GCC push_options
+#pragma GCC optimize("no-tree-loop-vectorize")
+#endif
 #include "fit.h"
 #include "next_echo.h"
 #include "decompose.h"
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC pop_options
+#endif
 #include "describe.h"
 #include "signal.h"
 #include "elementary.h"

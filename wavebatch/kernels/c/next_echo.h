@@ -16,41 +16,29 @@ static void set_equations(const Fit *fit, Work *work) {
     }
 }
 
-INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
-    lanes sum = ALL(0);
-    for (int64_t v = 0; v < n; v++) sum += a[v] * b[v];
-    return sum_lanes(sum);
-}
-
 /* The next two directions after the three that a fit of an echo removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. */
-INLINE void find_directions(const Window *w, float time, float inverse, Basis row, int weighed, int clipped, lanes *third, lanes *fourth) {
+INLINE void find_directions(const Window *w, float time, float inverse, Basis row, int weighed, lanes *third, lanes *fourth) {
     for (int64_t v = 0; v < w->vectors; v++) {
         const lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
         const lanes once = row.by_width[v] * z, twice = once * z;
-        lanes weight = weighed && w->is_weighted ? w->weight[v] : ALL(1);
-        if (clipped && w->any_clipped) weight = pick(w->clipped[v] != 0.f, ALL(0), weight); /* they may not count */
+        const lanes weight = weighed && w->is_weighted ? w->weight[v] : ALL(1);
         third[v] = (once * 8.f - row.by_time[v] * 12.f) * weight;
         fourth[v] = (twice * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
     }
 }
 
-/* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. Where levels are free, rows of the
-   fit lack their share of l, and z^2 times that would be more than the pulse: pulses are evaluated anew. */
-static void hermite_moments(const Settings *s, Work *work, const Fit *fit) {
+/* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. */
+static void hermite_moments(Work *work, const Fit *fit) {
     const Window *w = &work->window;
     const int64_t k = fit->k, n = w->vectors;
     const lanes *residual = work->rows + 3 * k * n;
-    const int anew = w->level_share > 0;
     lanes *third = work->about + 3 * n, *fourth = work->about + 4 * n;
     for (int64_t j = 0; j < k; j++) {
-        const Echo echo = {fit->parameters[j], fit->parameters[k + j], fit->parameters[2 * k + j], 0};
-        const float time = echo.time, inverse = 1 / echo.width;
-        lanes *first = anew ? work->about : work->rows + j * n;
-        const int64_t next = anew ? n : k * n; /* from the pulse to its slopes */
-        const Basis row = {first, first + next, first + 2 * next, third};
-        if (anew) evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
-        find_directions(w, time, inverse, row, anew, anew, third, fourth);
-        if (anew) { take_level_off(w, third); take_level_off(w, fourth); }
+        const float time = fit->parameters[k + j], inverse = 1 / fit->parameters[2 * k + j];
+        const Basis row = {work->rows + j * n, work->rows + (k + j) * n, work->rows + (2 * k + j) * n, NULL};
+        find_directions(w, time, inverse, row, 0, third, fourth);
+        take_level_off(w, 1, third);
+        take_level_off(w, 1, fourth);
         work->h3[j] = multiply(n, third, residual) / sqrt(fmax(multiply(n, third, third), 1e-12)) / w->std;
         work->h4[j] = multiply(n, fourth, residual) / sqrt(fmax(multiply(n, fourth, fourth), 1e-12)) / w->std;
     }
@@ -65,7 +53,7 @@ static void take_rows_off(Work *work, int64_t p, lanes *direction) {
         for (int64_t v = 0; v < n; v++) sum += work->rows[i * n + v] * direction[v];
         share[i] = sum_lanes(sum);
     }
-    solve(p, work->matrix, work->pivot, share);
+    solve(p, work->matrix, share);
     for (int64_t i = 0; i < p; i++) {
         const float part = share[i];
         for (int64_t v = 0; v < n; v++) direction[v] -= work->rows[i * n + v] * part;
@@ -81,16 +69,17 @@ static void whitened_moments(const Settings *s, Work *work, const Fit *fit) {
     Basis row = {work->about, work->about + n, work->about + 2 * n, third};
     set_equations(fit, work);
     factor(p, work->matrix, work->pivot, LEAST_PIVOT);
+    for (int64_t i = 0; i < p; i++) take_level_off(w, 1, work->rows + i * n);
     for (int64_t j = 0; j < k; j++) {
         const Echo echo = {fit->parameters[j], fit->parameters[k + j], fit->parameters[2 * k + j], 0};
         const float time = echo.time, inverse = 1 / echo.width;
         evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
-        find_directions(w, time, inverse, row, 1, 0, third, fourth);
+        find_directions(w, time, inverse, row, 1, third, fourth);
         double *moment[] = {work->h3 + j, work->h4 + j};
         for (int q = 0; q < 2; q++) {
             lanes *direction = q ? fourth : third;
             whiten(w, direction);
-            if (w->level_share > 0) take_level_off(w, direction);
+            take_level_off(w, 1, direction);
             const double all = multiply(n, direction, direction);
             take_rows_off(work, p, direction);
             if (q) {
@@ -269,7 +258,8 @@ static double propose_echo(const Settings *s, Work *work, const Fit *fit, const 
     const int64_t k = fit->k, p = 3 * k, n = w->vectors;
     lanes *onto = work->about + p * n;
     for (int64_t i = 0; i <= p; i++) {
-        if (w->level_share > 0) take_level_off(w, work->rows + i * n); /* once more: new pulses keep their share of it */
+        /* Twice in all: new pulses keep their share of it. */
+        take_level_off(w, w->is_whitened || i == p ? 1 : 2 - w->level_share, work->rows + i * n);
         if (w->is_whitened) filter_back(w, work->rows + i * n, work->back);
         correlate(work, w->is_whitened ? work->back : work->rows + i * n, work->taps, work->about + i * n);
     }

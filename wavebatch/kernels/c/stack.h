@@ -82,7 +82,7 @@ static void step_stacked(const Stacked *s, double damping, const double *normal,
         if (*own > 0 || there[a] != 0) *own += damping * fmax(*own, 1e-12 * largest);
     }
     factor(size, matrix, pivot, 0);
-    solve(size, matrix, pivot, there);
+    solve(size, matrix, there);
     for (int64_t a = 0; a < size; a++) there[a] = fmin(fmax(at[a] + there[a], s->low[a]), s->high[a]);
 }
 

@@ -37,7 +37,7 @@ typedef struct {
     lanes *back, *new_energy;                  /* where noise is whitened: a row filtered back; energy of a new pulse */
     Fit fit, next;
     Solution trial, best, spare;
-    double *kept, *products, *matrix, *pivot, *step, *column, *h3, *h4;
+    double *kept, *products, *matrix, *pivot, *step, *column, *along, *h3, *h4; /* along: products of the rows and the level */
     double *known;                             /* of amplitudes: one over variance, in noise, beside what the fit says */
     uint8_t *frozen;
     float *taps, *edges;                       /* of a new pulse; its energy, whitened, from each end of a window */
@@ -67,6 +67,7 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
         && enlarge(&w->fit.parameters, p * number) && enlarge(&w->fit.gram, p * p * number) && enlarge(&w->next.parameters, p * number)
         && enlarge(&w->kept, p * number) && enlarge(&w->products, p * p * number) && enlarge(&w->matrix, p * p * number)
         && enlarge(&w->pivot, p * number) && enlarge(&w->step, p * number) && enlarge(&w->column, p * p * number)
+        && enlarge(&w->along, p * number)
         && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->known, p * number) && enlarge(&w->frozen, p);
     Solution *all[] = {&w->trial, &w->best, &w->spare};
     for (int i = 0; i < 3 && good; i++)
@@ -78,7 +79,7 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
 
 static void free_work(Work *w) {
     void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->window.level, w->back, w->new_energy, w->rows, w->about, w->padded, w->coarse, w->energy,
-        w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
+        w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->along, w->h3, w->h4,
         w->known, w->frozen, w->taps, w->edges, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
         w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound,
         w->trial.misfit, w->best.misfit, w->spare.misfit};
