@@ -327,21 +327,17 @@ def test_a_pulse_made_by_hand_needs_parts_of_the_right_type():
 def test_wrong_use_is_said_in_the_words_of_the_user(strips, tmp_path):
     with wb.open_strip(strips[0]) as strip:
         survey, block = wb.survey(strip), next(strip.blocks())
-    with pytest.raises(TypeError, match="such as survey.system, not WaveformBlock and Survey"):
-        wb.load_chain("fast").run(block, survey)
+    refuses(TypeError, "such as survey.system, not WaveformBlock and Survey", wb.load_chain("fast").run, block, survey)
     silent = replace(survey.system, noise=wb.ReceiverNoise(std=0.0))
     with pytest.raises(wb.ConfigError, match=r"noise.std of a SystemPulse must be above 0 counts, got 0.0"):
         wb.load_chain("fast").run(block, silent)
     assert "1 failed: none.las: cannot be read" in repr(wb.run("none.las", tmp_path))
-    with pytest.raises(ValueError, match="is closed: use it inside its `with`"):
-        next(strip.blocks())
+    refuses(ValueError, "is closed: use it inside its `with`", next, strip.blocks())
     with pytest.raises(wb.ConfigError, match=r"--output .*out\.laz: this is a folder.* such as .*out$"):
         wb.run(strips[0], tmp_path / "out.laz")
     for given, empty in (((strips[0], ""), "--output: the name"), (("", tmp_path), "the name of a file")):
-        with pytest.raises(wb.ConfigError, match=f"^{empty} is empty$"):
-            wb.run(*given)
-    with pytest.raises(wb.StageError, match=r"got float64 .*round them"):
-        wb.WaveformBlock.from_samples(np.zeros((2, 8)))
+        refuses(wb.ConfigError, f"^{empty} is empty$", wb.run, *given)
+    refuses(wb.StageError, r"got float64 .*round them", wb.WaveformBlock.from_samples, np.zeros((2, 8)))
     with pytest.raises(wb.StageError, match="spacing must be above 0 ns, got 0"):
         wb.WaveformBlock.from_samples(np.zeros((2, 8), np.uint8), spacing=0)
     counts = np.ones((2, 8), np.uint8)

@@ -77,6 +77,9 @@ def test_what_a_strip_lacks_is_named_by_all_that_read_packets(tmp_path, command)
         assert "the header claims" in succeed("stats", strip).stdout
         lost = "with a packet before the start" if command == "run" else "cannot be used"
         assert "warning: the header claims" in said and lost in said, said
+        if command == "run":
+            warnings = json.loads((tmp_path / "out" / "strip.report.json").read_text())["warnings"]
+            assert {one["code"] for one in warnings} >= {"lost-points", "lost-packets"}
 
 
 def test_a_cloud_that_seems_to_hold_more_points_is_named_by_all_that_read_it(tmp_path):

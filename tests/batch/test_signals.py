@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from batch_tools import make_job
+from commands import refuses
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
@@ -147,8 +148,7 @@ def test_ctrl_c_inside_the_compressor_reaches_a_program_that_uses_the_library(st
     monkeypatch.setattr(write_points, "BytesIO", File)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with pytest.raises(KeyboardInterrupt):
-            run_batch([make_job(strip)], RunOptions(tmp_path))
+        refuses(KeyboardInterrupt, "", run_batch, [make_job(strip)], RunOptions(tmp_path))
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)

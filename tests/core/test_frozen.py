@@ -97,8 +97,7 @@ def test_objects_are_sorted_by_their_values():
     assert sorted(ranked) == ranked[::-1] and max(ranked) is ranked[0]
     assert ranked[1] <= Ranked(1, second="b") <= ranked[0] >= Ranked(2) > ranked[1]
     refuses(TypeError, "takes first, each once", Ranked, 1, "a")
-    with pytest.raises(TypeError):
-        sorted([Point(1), Point(2)])
+    refuses(TypeError, "", sorted, [Point(1), Point(2)])
 
 
 def test_nothing_can_be_changed():

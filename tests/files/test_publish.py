@@ -158,6 +158,7 @@ def test_of_many_writers_exactly_one_wins(tmp_path):
 
 def test_stale_files_go_and_those_being_written_stay(tmp_path):
     alive = write(tmp_path / "a", b"alive")
+    assert alive.path.name.startswith(f".wavebatch-{os.getpid()}-")
     code = (
         "import sys, time; from pathlib import Path; from wavebatch.files.disk.publish import Draft\n"
         "draft = Draft(Path(sys.argv[1]), overwrite=False); print('ready', flush=True); time.sleep(600)"

@@ -65,7 +65,8 @@ def hold(tmp_path):
 def test_a_folder_is_there_while_it_is_needed(tmp_path):
     with temp_store.owning_scratch(tmp_path) as folder:
         inner = temp_store.make_folder()
-        assert inner.parent == folder and folder.parent == tmp_path and folder.name.startswith(".wavebatch-")
+        assert inner.parent == folder and folder.parent == tmp_path
+        assert folder.name.startswith(".wavebatch-") and f"-{os.getpid()}-" in folder.name
         assert temp_store.remove_orphans(tmp_path) == []
         (inner / "file").write_text("x")
     assert list(tmp_path.iterdir()) == []

@@ -394,8 +394,7 @@ def test_arrays_that_the_library_would_read_beyond_are_refused():
         ("missing", np.zeros((2, 7), bool)),
         ("counts", np.full((2, 8), np.nan, np.float32)),
     ):
-        with pytest.raises(ValueError):
-            decompose_clusters(samples._replace(**{name: value}), start, good, settings())
+        refuses(ValueError, "", decompose_clusters, samples._replace(**{name: value}), start, good, settings())
     shorter = (samples, start._replace(width=np.empty(0)), good), (samples, start, good._replace(low=np.zeros(2, int)))
     for wrong in shorter:
         refuses(ValueError, "differ in length", decompose_clusters, *wrong, settings())

@@ -3,6 +3,7 @@
 import naive_describe as naive
 import numpy as np
 import pytest
+from commands import refuses
 
 from wavebatch.kernels.fit import describe
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
@@ -115,7 +116,5 @@ def test_arrays_that_the_library_would_read_beyond_are_refused(rng):
         {"first": sums.first[:-1]}, {"first": sums.first + 1}, {"left": sums.left[:, 1:]}, {"used": sums.used[1:]},
         {"main": sums.main * [1, 1, 0]}, {"main": sums.main * np.nan},
     ):  # fmt: skip
-        with pytest.raises(ValueError):
-            describe.describe_left(sums._replace(**wrong), NOISES[0], [0.0])
-    with pytest.raises(ValueError):
-        describe.describe_left(sums, describe.SampleNoise(0.0), [0.0])
+        refuses(ValueError, "", describe.describe_left, sums._replace(**wrong), NOISES[0], [0.0])
+    refuses(ValueError, "", describe.describe_left, sums, describe.SampleNoise(0.0), [0.0])

@@ -117,6 +117,12 @@ def test_generalized_gaussians_fit_flat_and_peaked_echoes(power):
     fwhm = 2 * (2 * np.log(2)) ** (1 / power) * 3.0
     np.testing.assert_allclose(2.354820 * found.sigma, fwhm, rtol=0.03)
     assert np.median(found.residual) < 1.3
+    # Amplitude and width are correlated: their product is known better or worse than both.
+    parts = [naive.power_pulse(x, 30.5, 3.0 + off, power) for off in (-0.01, 0.01)]
+    slopes = np.stack([200 * np.gradient(sum(parts) / 2, x), sum(parts) / 2, 200 * (parts[1] - parts[0]) / 0.02])
+    share = np.array([0.0, 1 / 200, 1 / 3.0])
+    expected = 0.5 * np.sqrt(share @ np.linalg.inv(slopes @ slopes.T) @ share)
+    assert np.median(found.relative_energy_err) == pytest.approx(expected, rel=0.02)
     if power != 2.0:
         assert np.median(decompose("gaussian", block, noise, system).residual) > 3
 

@@ -297,6 +297,9 @@ def test_thinned_points_over_ground_in_common_are_no_other_rate_of_pulses(tmp_pa
         seen = found._replace(rate=rate * known.rate, places=places)
         growth, lines, _ = compare_setting(known, seen, SystemPulse(2.0))
         assert (growth > 2.0) == grows == bool(lines)
+    for rows in found.places.values():
+        rows[2] += 0.04  # too little for a proof
+    assert compare_setting(known, found._replace(rate=known.rate), SystemPulse(2.0))[0] == pytest.approx(0.041, abs=0.005)
 
 
 @pytest.mark.slow
@@ -732,7 +735,7 @@ def test_an_outline_around_many_fields_is_named_and_in_the_error(tmp_path, calib
     (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.3,{EAST + 50},{NORTH + 10},150\n")
     done = call("calibrate", calibrated / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
     assert done.exit_code == 0 and "several surfaces? Check its outline" in done.stderr
-    assert load_calibration(tmp_path / "cal.toml").relative_error > 0.12
+    assert load_calibration(tmp_path / "cal.toml").relative_error > 0.6
 
 
 @pytest.mark.parametrize("off", [0, 4])

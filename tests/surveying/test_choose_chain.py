@@ -176,6 +176,7 @@ def test_a_chain_that_does_not_fit_the_pulse_is_named_and_its_false_echoes_count
     assert result.exit_code == 0
     report = _report(tmp_path, "ringing")
     (line,) = result.stderr.splitlines()
+    assert report["warnings"][0]["code"] == "false-echoes"
     assert line.endswith(f"warning: {report['warnings'][0]['text']}")
     found = re.search(r"pulse, .* about (\d+) of its (\d+) echoes are false .* use --profile auto", line)
     assert int(found[2]) == report["counts"]["echoes"]

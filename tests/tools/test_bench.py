@@ -253,14 +253,12 @@ def test_worker_answers_raises_and_dies():
     with command.Worker() as worker:
         assert worker.call(os.getenv, "OPENBLAS_NUM_THREADS") == "1"
         assert worker.call(os.getpid) != os.getpid()
-        with pytest.raises(FileNotFoundError):
-            worker.call(os.stat, "/no/such/file")
+        refuses(FileNotFoundError, "", worker.call, os.stat, "/no/such/file")
         memory = worker.call(command.peak_memory)
         assert memory is None or 5e6 < memory < 1e9
     with command.Worker() as worker:
         for _ in range(2):  # a dead process takes no further call
-            with pytest.raises(WorkerDied):
-                worker.call(os._exit, 3)
+            refuses(WorkerDied, "", worker.call, os._exit, 3)
 
 
 def test_closing_a_worker_ends_a_call_that_hangs():

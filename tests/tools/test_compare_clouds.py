@@ -525,8 +525,7 @@ def test_what_the_readme_says_of_the_real_strip(riegl):
     assert two.fit["b"]["all"].median < two.fit["a"]["all"].median < 0.5 * one.fit["b"]["all"].median
     assert (one.waveforms, one.returns) == (2375, 2535)
     assert two.vendor["b"].completeness > 0.99 and 0.03 < two.vendor["b"].gain < 0.12
-    with pytest.raises(InputError):
-        match_sides(riegl, Contender("auto"), find_contender(str(riegl.with_suffix(".wdp"))))
+    refuses(InputError, "", match_sides, riegl, Contender("auto"), find_contender(str(riegl.with_suffix(".wdp"))))
 
 
 FINE = 100.0

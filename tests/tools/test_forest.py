@@ -223,8 +223,7 @@ def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
     with pytest.raises(ConfigError, match="layers are thinner than the voxels, .*; give 1 or more"):
         Forest([even[1]], 10.0, ForestOptions(layer=0.5))
     for wrong in ({"leaf_projection": 0.0}, {"layer": 0.0}, {"layer": np.nan}):
-        with pytest.raises(ConfigError):
-            ForestOptions(**wrong)
+        refuses(ConfigError, "", ForestOptions, **wrong)
 
 
 @pytest.fixture
