@@ -72,7 +72,7 @@ def folder(riegl, tmp_path_factory):
     document = _print("run", riegl, "-o", place, "--profile", "fast", "--columns", columns, "-q")
     (place / "run.json").write_text(json.dumps(document))
     _print("slice", riegl, "-o", place / "s.csv", "--cube", place / "cube.npz", "-q")
-    _print("voxelize", riegl, "--size", 3, "-o", place / "voxels.npz", "-q")
+    _print("voxelize", riegl, "--size", 3, "--iterations", 1, "-o", place / "voxels.npz", "-q")
     _print("simulate", "mixed", "-o", place / "sim.las", "--pulses", 300, "-q")
     return place
 
@@ -111,7 +111,7 @@ CASES = {
     "export STRIP -o e.npz -q": "export/1",
     "synthesize SIM -o y.las -q": "synthesize/1",
     "slice STRIP -o s.csv -q": "slice/1",
-    "voxelize STRIP --size 3 -o v.npz -q": "voxelize/1",
+    "voxelize STRIP --size 3 --iterations 1 -o v.npz -q": "voxelize/1",
 }
 
 

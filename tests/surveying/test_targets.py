@@ -40,8 +40,7 @@ def test_long_packets_of_the_digitizer_have_its_constant(riegl, tmp_path):
     """Descriptor 2 of this strip differs in the number of samples only: a run takes the constant of the other."""
     (tmp_path / "t.csv").write_text("reflectance,x,y,radius\n0.3,548355,5389940,3\n")
     cal = tmp_path / "cal.toml"
-    done = call("calibrate", riegl, "--targets", tmp_path / "t.csv", "-o", cal)
-    assert done.exit_code == 0 and "has no constant" not in done.stderr
+    assert "has no constant" not in succeed("calibrate", riegl, "--targets", tmp_path / "t.csv", "-o", cal).stderr
     assert [row.digitizer for row in load_calibration(cal).channels] == [1]
     call("run", riegl, "-o", tmp_path, "--calibration", cal, "-q")
     cloud = laspy.read(tmp_path / f"{riegl.stem}.laz")

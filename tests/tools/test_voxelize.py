@@ -36,6 +36,8 @@ from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.4, std=1.05))
 SAVED = SavedSurvey(Survey(SYSTEM, 1000))
 DOWN = np.array([0.0, 0.0, -HALF_C])
+QUICK = Deconvolution(iterations=2)
+"""Where it does not matter how sharp the light is."""
 
 
 def write_strip(path, echoes, *, sigma=2.0, height=110.0, directions=None, xy=None, point_format=4, wkt=None, bits=8,
@@ -111,8 +113,7 @@ def forest(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("scene", "method", "seed", "least", "most"),
-    [*(("flat", "richardson_lucy", seed, 0.997, 1.01) for seed in (1, 2, 3)),
-     *(("forest", "richardson_lucy", seed, 0.995, 1.01) for seed in (1, 2, 3)),
+    [("flat", "richardson_lucy", 1, 0.997, 1.01), ("forest", "richardson_lucy", 2, 0.995, 1.01),
      ("flat", "gold", 4, 0.97, 1.06), ("flat", "wiener", 4, 0.97, 1.06)],
 )  # fmt: skip
 def test_energy_is_that_of_the_echoes(scene, method, seed, least, most):
@@ -146,13 +147,12 @@ def test_a_learned_pulse_ends_where_nothing_was_measured():
     assert area == pytest.approx(taps.sum())
 
 
-@pytest.mark.parametrize("seed", [5, 6])
-def test_noise_is_no_signal(seed):
-    block, truth = simulate_block("empty", 6000, np.random.default_rng(seed))
+def test_noise_is_no_signal():
+    block, truth = simulate_block("empty", 6000, np.random.default_rng(5))
     empty = truth.count(len(block)) == 0
     seen = deconvolve_block(block, SYSTEM, Deconvolution()).seen
     assert seen[empty].mean() < 0.005 and seen[~empty].mean() > 0.98
-    louder = deconvolve_block(block, SYSTEM, Deconvolution(), np.random.default_rng(seed)).seen
+    louder = deconvolve_block(block, SYSTEM, Deconvolution(), np.random.default_rng(5)).seen
     assert louder[empty].mean() < 0.005, "nor where noise is added"
     loose = deconvolve_block(block, SYSTEM, Deconvolution(threshold=1.0)).seen
     assert loose[empty].mean() > 0.05
@@ -350,7 +350,8 @@ def test_light_goes_out_along_the_ray_and_empty_voxels_are_written_on_request(tm
 def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target):
     """Of voxels and of profiles."""
     strip, _ = forest
-    options = {"all_crossed": target == "v.npz", "overwrite": True, "profiles": tmp_path / "p.npz"}
+    options = {"all_crossed": target == "v.npz", "overwrite": True, "profiles": tmp_path / "p.npz",
+               "deconvolution": QUICK}  # fmt: skip
     made = set()
     for block_size, held in ((None, 400_000), (97, 1 << 20), (600, 500), (1500, 3)):
         voxelize(strip, tmp_path / target, 0.8, block_size=block_size, held=held, **options)
@@ -642,9 +643,10 @@ QUIET = SavedSurvey(Survey(SystemPulse(2.0, noise=NOISE), 1000))
 N = 1500
 
 
-def voxelize_pulses(strip, folder, *, size=1.0, ratio=2.0, where=None, all_crossed=True, **options):
+def voxelize_pulses(strip, folder, *, how=None, size=1.0, ratio=2.0, where=None, **options):
     chosen = PointFilter.build(where=where)
-    settings = VoxelOptions(size, headroom=50.0, reflectance_ratio=ratio, all_crossed=all_crossed, chosen=chosen)
+    how = how or Deconvolution()
+    settings = VoxelOptions(size, how, headroom=50.0, reflectance_ratio=ratio, all_crossed=True, chosen=chosen)
     summary = voxelize_strip(strip, folder / "v.npz", settings, system=QUIET, force=True, overwrite=True, **options)
     with np.load(folder / "v.npz") as file:
         return summary, {name: file[name] for name in file}
@@ -823,7 +825,7 @@ def test_returns_that_are_missing_or_stand_far_apart_are_named(strips, canopy, e
         (whole, None, ""), (whole, 600, ""), (by_number, None, ""), (by_number, 600, "stand far apart in the file"),
         (thinned, None, f"{len(time) - N} of {len(time)} returns that"),
     ):  # fmt: skip
-        summary, _ = voxelize_pulses(strip, tmp_path, unit_points=unit_points)
+        summary, _ = voxelize_pulses(strip, tmp_path, how=QUICK, unit_points=unit_points)
         said = [line for line in summary.warnings if "in the file" in line]
         assert len(said) == bool(words) and all(words in line for line in said), (strip, unit_points)
 
@@ -842,11 +844,11 @@ def test_pulses_of_equal_time_are_not_one(canopy, tmp_path, apart):
     time = 1000.0 + np.arange(n) // 2 * 1e-5
     strip = write_recorded(tmp_path / "s.las", counts, begin, xy, echoes, record(counts, 4), time=time,
                            direction=direction, scanner=scanner)  # fmt: skip
-    summary, found = voxelize_pulses(strip, tmp_path)
+    summary, found = voxelize_pulses(strip, tmp_path, how=QUICK)
     assert summary.pulses == n
     assert found["light"][layer_of(found) == 126].sum() == pytest.approx(n, abs=12 if apart == "direction" else 0)
     if apart == "scanner":
-        summary, _ = voxelize_pulses(strip, tmp_path, where="scanner_channel == 1")
+        summary, _ = voxelize_pulses(strip, tmp_path, how=QUICK, where="scanner_channel == 1")
         assert summary.pulses == n / 2 and summary.left_out + summary.waveforms > n
 
 
@@ -855,7 +857,7 @@ def test_times_of_many_packets_are_no_pulse(canopy, tmp_path):
     *pulses, _ = canopy
     for time in (0.0, 77.0):
         strip = write_recorded(tmp_path / f"{time}.las", *pulses, record(canopy[0], 4), time=np.full(N, time))
-        summary, _ = voxelize_pulses(strip, tmp_path)
+        summary, _ = voxelize_pulses(strip, tmp_path, how=QUICK)
         assert summary.pulses == summary.waveforms > N and summary.several_packets == summary.lost_packets == 0
 
 
@@ -943,7 +945,7 @@ def test_a_wrong_ratio_is_within_the_errors(tmp_path):
 
 def test_where_takes_whole_pulses(strips, tmp_path):
     """The ground's return chooses the pulse, with its canopy."""
-    summary, found = voxelize_pulses(strips[1], tmp_path, where="z < 102")
-    whole, _ = voxelize_pulses(strips[1], tmp_path)
+    summary, found = voxelize_pulses(strips[1], tmp_path, how=QUICK, where="z < 102")
+    whole, _ = voxelize_pulses(strips[1], tmp_path, how=QUICK)
     assert 0.8 * N < summary.pulses < N and summary.waveforms + summary.left_out == whole.waveforms
     assert shares(found, LAYERS)[0] > 0.1

@@ -31,6 +31,7 @@ from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets, name_gains
+from wavebatch.surveying.sensor import plain
 from wavebatch.surveying.systems.known_systems import doubt_survey
 from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey
 
@@ -359,7 +360,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...]
     if second is not None and "incidence_angle_normals" in second.stage.makes and unseen > UNSEEN_TURN:
         lines.append(
             "incidence_angle_normals: this strip does not show well whether its packet vectors are turned against the "
-            f"points: the errors hold {float(f'{sensor.turned:.1g}'):g} degrees of it; --trajectory would show it"
+            f"points: the errors hold {plain(sensor.turned, 1)} degrees of it; --trajectory would show it"
         )
     system = prepared.system
     errors = {"hidden_light": "amplitudes and energies", "hidden_width": "widths"}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry import ray_convergence
 from wavebatch.kernels.physics.radiometry import mean_haze
 from wavebatch.surveying.measuring.return_scatter import ReturnScatter
+
+plain = partial(np.format_float_positional, unique=False, fractional=False, trim="-")
+"""A number as text without powers of ten; precision: the digits that count."""
 
 NODE_SECONDS = 0.5
 """Time between two positions that are estimated from rays [s]."""
@@ -220,16 +224,16 @@ class SensorSource:
         if self.height and facts.get("relief_m", 0.0) > HEIGHT_ERROR * self.height:
             return (
                 f"range: --flight-height is one number, but heights scatter by {facts['relief_m']:.0f} m: the "
-                f"error of the ranges, {float(f'{self.error:.2g}'):g} m, holds it; give --trajectory"
+                f"error of the ranges, {plain(self.error, 2)} m, holds it; give --trajectory"
             )
         if facts.get("is_turned"):
             off, error = facts["turned_deg"], facts["turned_error_deg"]
-            shown, known, most = (f"{float(f'{value:.2g}'):g}" for value in (off, error, off + error))
+            shown, known, most = (plain(value, 2) for value in (off, error, off + error))
             size = f"{shown} degrees, known to {known}" if off > error else f"up to {most} degrees"
             off += error * (off <= error)
             return (
                 f"angles: the packets' vectors are turned against the points by {size}: echoes 10 m from a return are "
-                f"{float(f'{1000 * np.radians(off):.1g}'):g} cm off, and the errors of angles and of ranges "
+                f"{plain(1000 * np.radians(off), 1)} cm off, and the errors of angles and of ranges "
                 "(range_error) hold it; compute points and vectors with the same mounting"
             )
         late, behind = (facts.get(name) or 0.0 for name in ("late_s", "behind_m"))
@@ -237,7 +241,7 @@ class SensorSource:
             return (
                 f"range: the trajectory is {abs(behind):.1f} m {'behind' if late > 0 else 'ahead of'} the packets' "
                 f"vectors, as if its clock were off by {late:+.2f} s: check its clock and lever arm; the error of the "
-                f"ranges, {float(f'{self.error:.2g}'):g} m, holds it"
+                f"ranges, {plain(self.error, 2)} m, holds it"
             )
         if self.farther is None or abs(self.farther) <= max(LEAST_DOUBT, 5.0 * (self.vectors_error or 0.0)):
             return ""

@@ -258,8 +258,7 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     few = alone < FEW and (not agreed if waveforms < HALVED else unsure and not (known or system.components))
     if few:
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
-    measured = system.noise.by_kind
-    unseen = measured.get("quiet") == 0 and "outside" not in measured
+    unseen = system.noise.by_kind.get("quiet") == 0
     if unseen and not reason:
         reason = "too few samples without signal"
     remedy = "give --system, a survey of a longer strip of this sensor"

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 NOISE_KINDS = {
     "quiet": "quiet samples",
     "quiet_pulse": "quiet samples, as a pulse sees it",
-    "outside": "outside of echoes",
-    "outside_pulse": "outside, as a pulse sees it",
     "core": "left by fits in strong echoes",
     "weak_echoes": "left by fits in weak echoes",
 }
