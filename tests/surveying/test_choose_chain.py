@@ -7,7 +7,7 @@ from pathlib import Path
 import kept_surveys
 import pytest
 from batch_tools import read_cloud
-from commands import run_command
+from commands import fail, run_command
 from helpers_scenes import make_scene
 
 from wavebatch.files.strip.reader import StripReader
@@ -141,10 +141,11 @@ def test_a_tolerance_takes_the_cheapest_chain_that_meets_it(strips, tmp_path):
     assert fast > balanced > 0.038 > accurate and forest["chain"] == "profile accurate"
 
 
-def test_no_chain_that_meets_the_tolerance_is_2_and_one_line(strips, tmp_path):
+def test_no_chain_that_meets_the_tolerance_is_2_and_one_line(strips, saved, tmp_path):
     result = _run(strips / "forest.las", "-o", tmp_path, "--tolerance", "1mm")
     assert result.exit_code == 2 and result.stderr.count("\n") == 1
     assert "no shipped chain meets a tolerance of 0.001 m" in result.stderr and "accurate 0.0" in result.stderr
+    fail(2, "no shipped chain", "run", strips / "flat.las", "-o", tmp_path, "--tolerance", "1mm", "--system", saved)
     assert list(tmp_path.iterdir()) == []
     some = _run(strips, "-o", tmp_path, "-q", "--tolerance", "1.5cm")
     assert some.exit_code == 3 and (tmp_path / "flat.laz").exists() and not (tmp_path / "forest.laz").exists()

@@ -74,19 +74,17 @@ def stack_pulse(
     before: float,
     after: float,
     std: float = 0.0,
-    first: np.ndarray | int = 0,
     cut: np.ndarray | None = None,
 ) -> Stack:
     """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it.
 
-    first: sample at which each row of the signal begins, int or int (m,).
     std: error of a sample that counts have without any noise; where they are rounded more coarsely than they scatter,
     the values of a bin may all be equal without being exact.
     cut: samples that were cut off below, bool (m, s). The median does not see by how much, unless most are cut off.
     """
     step = float(np.clip(IN_BIN / max(len(amplitude), 1), STEP, 1.0))
     least = max(std / float(median(amplitude)), 1e-6) if len(amplitude) else 1e-6
-    lag = np.reshape(first, (-1, 1)) + np.arange(signal.shape[1]) - time[:, None]
+    lag = np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
     # Plus values spread evenly over one step of the counts, whose rounding has the standard deviation `std`: the median
     # of whole counts is one of them, and so off by up to half a step, which gave pulses a tail of .5 %. They come from

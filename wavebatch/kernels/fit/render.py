@@ -24,8 +24,7 @@ VANISHED = 15.0
 
 def render_echoes(
     shape: PulseShape, n: int, s: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray,
-    rows: int = ROWS,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """The sum of all pulses of each waveform.
 
     Parameters
@@ -38,8 +37,6 @@ def render_echoes(
         Row of each echo, ascending.
     time, amplitude, width : float (m,), samples, count, samples
         Parameters of each echo.
-    rows : int
-        Echoes at a time, about; changes nothing but memory.
 
     Returns
     -------
@@ -49,7 +46,7 @@ def render_echoes(
     signal = np.zeros((n, s), np.float32)
     x = np.arange(s, dtype=np.float32)
     # Parts end with a waveform, so that the order in which its echoes are added does not depend on the others.
-    borders = np.append(distinct(np.searchsorted(waveform, waveform[::rows])), len(waveform))
+    borders = np.append(distinct(np.searchsorted(waveform, waveform[::ROWS])), len(waveform))
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
         part = slice(begin, end)
         t, w, height = (values[part].astype(np.float32) for values in (time, width, amplitude))

@@ -23,6 +23,9 @@ CURVATURE = 1.5
 PERIOD = 4
 """Samples after which a pattern repeats: converters are two or four, which take samples in turn."""
 
+FROM_LINE = 4.0
+"""A smoothed sample further from the line than this many standard deviations is signal."""
+
 SEGMENTS = 6
 """Parts of a waveform whose lower quartiles give its first slope."""
 
@@ -171,7 +174,6 @@ def fit_slopes(
     signal: np.ndarray,
     std: float,
     reach: int,
-    limit: float = 4.0,
     missing: np.ndarray | None = None,
     recovery: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -185,8 +187,6 @@ def fit_slopes(
         Noise of a sample.
     reach : int, samples
         Samples this near to signal are not quiet.
-    limit : float
-        A smoothed sample further from the line than this many standard deviations is signal.
     missing : bool (s, n), optional
         Samples that were not recorded.
     recovery : int, samples
@@ -211,7 +211,7 @@ def fit_slopes(
     number = total = np.zeros(signal.shape[1])
     for extra in (2.0, 1.0, 0.0):
         rest = signal - (level + slope * x)
-        quiet = find_quiet(rest, np.float32(limit * (SMOOTH_GAIN + extra) * std + 0.25), reach, recovery)
+        quiet = find_quiet(rest, np.float32(FROM_LINE * (SMOOTH_GAIN + extra) * std + 0.25), reach, recovery)
         if missing is not None:
             quiet &= ~missing
         number = np.maximum(quiet.sum(axis=0), 1)

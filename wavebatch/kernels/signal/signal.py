@@ -176,15 +176,14 @@ def transpose_samples(samples: np.ndarray) -> np.ndarray:
     return samples.T.astype(np.float32, order="C")
 
 
-def smooth_121(signal: np.ndarray, step: int = 1) -> np.ndarray:
-    """Signal (s, n) filtered with [1 2 1]/4, taps `step` samples apart; the end samples are repeated outwards."""
+def smooth_121(signal: np.ndarray) -> np.ndarray:
+    """Signal (s, n) filtered with [1 2 1]/4; the end samples are repeated outwards."""
+    if len(signal) < 2:
+        return signal.copy()
     smoothed = np.empty_like(signal)
-    if len(signal) < 2 * step:
-        smoothed[:] = signal
-        return smoothed
-    np.add(signal[: -2 * step], signal[2 * step :], out=smoothed[step:-step])
-    np.add(signal[0], signal[step : 2 * step], out=smoothed[:step])
-    np.add(signal[-1], signal[-2 * step : len(signal) - step], out=smoothed[-step:])
+    np.add(signal[:-2], signal[2:], out=smoothed[1:-1])
+    np.add(signal[0], signal[1], out=smoothed[0])
+    np.add(signal[-1], signal[-2], out=smoothed[-1])
     smoothed += signal
     smoothed += signal
     smoothed *= np.float32(0.25)
