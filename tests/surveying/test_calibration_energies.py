@@ -10,8 +10,10 @@ import pytest
 import wavebatch as wb
 from tests.facet_strips import FARMLAND, START, Sensor, compare_fields, write_field, write_strip
 from tests.surveying.test_calibration_misuse import BASE, LIGHT, call
+from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
-from wavebatch.surveying.matching.strip_energies import _compare_unknown
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.matching.strip_energies import _compare, _compare_unknown
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -87,6 +89,14 @@ def test_energies_that_only_one_of_both_has_are_named_and_in_the_error(
     assert said in line and (said or "energies of" not in line and "each pulse" not in line)
     assert np.median(stated) == pytest.approx(error, abs=0.005)
     assert np.mean(np.abs(off) < stated) > 0.62
+
+
+@pytest.mark.parametrize(("own", "stuck"), [(0.06, False), (0.057, False), (0.05, True), (0.0, True)])
+def test_logs_of_one_laser_that_scatter_alike_are_not_stuck(own, stuck):
+    """6.0 % beside 6.1 % of the calibration was called a log that stands still."""
+    known = Calibration(1.0, 0.03, energy_mean=1.0, energy_spread=0.061)
+    lacks, line = _compare(PulseEnergy("log.csv", shots=own), known)
+    assert ("is the log stuck?" in line) == stuck and lacks == pytest.approx((0.061**2 - own**2) ** 0.5)
 
 
 @pytest.mark.quick_cases("held", "right")

@@ -572,6 +572,17 @@ def test_a_target_that_is_a_spot_in_its_outline_has_an_error_that_holds(tmp_path
     assert off < 1.1 * found.relative_error and (found.relative_error < 0.04) == (radius > 3)
 
 
+def test_footprints_on_both_surfaces_do_not_halve_the_error_of_a_target(tmp_path):
+    """Declared as 3 m, .8 m of a dark target: a constant of half, where the error said 45 %."""
+    dense = Sensor(speed=8.0, rate=30_000.0, line_rate=100.0, half_angle=2.0, start=(12.0, 10.0), light=LIGHT)
+    spot = Facet(0.3, inside=box(49.6, 9.6, 50.4, 10.4))
+    write_strip(tmp_path / "a.las", [spot, Facet(0.6)], dense, 14_000, seed=100)
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.3,{EAST + 50},{NORTH + 10},1.5\n")
+    found, said = calibrate(tmp_path, "--divergence", 0.5, strips=["a.las"])
+    assert "darker or brighter than the target by far" in said
+    assert 0.9 < abs(4 / (2 * LIGHT) / found.constant - 1) < 1.1 * found.relative_error
+
+
 def test_a_target_that_is_clipped_is_refused(tmp_path):
     bright = replace(SLOW, bits=8, energy_spread=0.03, light=235 / 0.5 * 700**2 * 10 ** (2e-4 * 0.22 * 700))
     write_strip(tmp_path / "a.las", [Facet(0.5, inside=disc(4.0)), Facet(0.28)], bright, 8000, seed=3)

@@ -242,6 +242,18 @@ def test_rolling_ground_shows_a_turn_about_any_axis_and_ranges_are_right_then(ax
     assert np.sqrt(np.mean(off**2)) < found.error + 0.01 < 0.15
 
 
+@pytest.mark.parametrize(("degrees", "named"), [(0.0, False), (0.01, False), (0.3, True), (-1.0, True)])
+def test_vectors_that_roll_along_the_strip_are_named_and_in_the_errors(degrees, named):
+    """A roll that grows is no drift of the aircraft: 26 to 40 % of the angles were within their errors."""
+    vectors, none = flight_of_turned_vectors(np.eye(3), pairs=0)
+    roll = np.radians(degrees) * (vectors.time - START_TIME) / 3.0
+    x, y, z = vectors.direction.T
+    rolled = np.stack([x, y * np.cos(roll) - z * np.sin(roll), z * np.cos(roll) + y * np.sin(roll)], axis=1)
+    found = estimate_path(vectors._replace(direction=rolled), "direction vectors", none)
+    assert ("turned against the points" in found.doubt()) == named
+    assert (0.4 * abs(degrees) if named else 0.0) < found.turned < max(abs(degrees), 0.03)
+
+
 @pytest.mark.parametrize(("degrees", "error"), [(0.3, 0.0242), (1.0, 0.0309)])
 def test_how_large_turns_are_is_found_with_them_and_scanners_set_a_floor(degrees, error):
     """A first round alone gave 0.971 of 1 degree; mirrors have one floor in all windows, relief one in each."""

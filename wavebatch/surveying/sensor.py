@@ -115,7 +115,8 @@ least standard deviation of these heights that counts, over the distance: drifts
 
 OF_JUMP = 2.0
 """By how much a path jumps where vectors are turned in a part of the strip, over what the line between the neighbours
-shows of it: 0.5 to 3 times, since windows of rays may reach over the jump."""
+shows of it: 0.5 to 3 times, since windows of rays may reach over the jump. And how far turns that vary from window to
+window reach, over their standard deviation: those that grow evenly 1.7 times."""
 
 TURNED = ("turned_deg", "turned_error_deg", "is_turned")
 """Facts of a turn of the packet vectors."""
@@ -531,7 +532,7 @@ def find_turn(
     -----
     docs/algorithms.md 5.1.
     """
-    known, right, shift = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
+    known, right, shift, varied = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     parts: list[ray_convergence.TurnSeen] = []
     end = -np.inf
     for fit in fits:
@@ -549,7 +550,11 @@ def find_turn(
             seen = np.linalg.pinv(total, hermitian=True) @ sides[:, kind].sum(axis=0)
             off = sides[:, kind] - each[:, kind] @ seen
             apart = np.einsum("wi,wij,wj->", off, np.linalg.pinv(each[:, kind], hermitian=True), off)
-            total = total / max(1.0, apart / max(3 * len(parts) - 3, 1))
+            apart /= max(3 * len(parts) - 3, 1)
+            if not kind and apart > SURE_TURN:  # vectors that roll by themselves, each window in its own way
+                alone = np.linalg.solve(each[:, 0] + np.eye(3) / MOUNTING**2, sides[:, 0, :, None])[:, :, 0]
+                varied = OF_JUMP**2 * np.cov(alone.T)
+            total = total / max(1.0, apart)
             both = total @ np.linalg.pinv(total + floor, hermitian=True) @ floor
             known, right = known + both, right + both @ seen
     by_pairs, side = _turn_by_pairs(pairs)
@@ -562,13 +567,14 @@ def find_turn(
     for _ in range(TURN_ROUNDS if moved else 0):
         error = np.linalg.inv(known + np.eye(3) / (MOUNTING**2 + turn @ turn))
         turn = error @ (right + side)
-    error = error if moved else np.linalg.inv(known + np.eye(3) * (2.0 / MOUNTING) ** 2)
+    error = varied + (error if moved else np.linalg.inv(known + np.eye(3) * (2.0 / MOUNTING) ** 2))
     unit = _unit(vectors.direction)
     unit = unit[np.isfinite(unit[:, 0])]
     across = np.eye(3) - unit.T @ unit / max(len(unit), 1)
     angle, doubt = float(np.sqrt(turn @ across @ turn)), float(np.sqrt(0.5 * np.sum(across * error)))
     moved = bool(moved and angle > LEAST_TURN)
-    values = (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), moved)
+    seen = moved or bool(np.trace(varied) > LEAST_TURN**2)
+    values = (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), seen)
     facts = dict(zip(TURNED, values, strict=True))
     left = error if moved else np.outer(turn, turn) * (angle > LEAST_TURN)
     off = float(np.sqrt(np.sum(np.einsum("ni,ij,nj->n", unit @ shift, left, unit @ shift)) / max(len(unit), 1)))

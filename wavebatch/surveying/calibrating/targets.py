@@ -258,7 +258,8 @@ def measure_target(
     off = np.abs(relative / np.median(relative) - 1.0)
     other_surface = off > max(STRANGE_SIGMA * MAD_TO_STD * float(np.median(off)), LEAST_EDGE)
     strange = float(np.mean(other_surface))
-    strange_err = float(np.median(off[other_surface])) if strange > MOST_STRANGE else 0.0
+    # Footprints on both surfaces lie between them: the farthest tell the other one.
+    strange_err = float(np.quantile(off[other_surface], 0.84)) if strange > MOST_STRANGE else 0.0
     result = replace(
         summarise(blank, constant),
         incidence_deg=float(np.degrees(np.median(angle[used]))),

@@ -58,8 +58,9 @@ LEAST_COMPARED = 200
 PLACES, OF_PLACE, LEAST_PLACES = 32, 128, 8
 """Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest."""
 
-LEAST_SAID = 0.01
-"""Smaller errors are not named."""
+LEAST_SAID, STUCK = 0.01, 0.9
+"""Smaller errors are not named; and the scatter of a log over that of the calibration's from which it does not stand
+still: samples of one laser's pulses agree within some per cent."""
 
 
 @frozen
@@ -251,7 +252,7 @@ def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[floa
         f"--energy {energy.source}: its values scatter by {100 * own:.1f} % from shot to shot, those of the "
         f"calibration by {100 * scatter:.1f} %: is the log stuck? The rest is in the error"
     )
-    return lacks, line if lacks > LEAST_SAID else ""
+    return lacks, line if lacks > LEAST_SAID and own < STUCK * scatter else ""
 
 
 def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy | None) -> np.ndarray:

@@ -174,8 +174,10 @@ def compare_setting(
         alike, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
         chance = calibration.change_chance
         change = change or settings.compare_scenes(scene or (), row.scene, louder, chance=chance, usual=usual)
-        # What common ground shows is in the error, whatever changed it.
-        more = math.expm1(max(change.error, abs(change.shift) * bool(ground or change.chance > settings.LIKELY)))
+        # What common ground shows is in the error, whatever changed it, with half of what it is uncertain: 68 % of the
+        # changes that may have made it are smaller.
+        seen = bool(ground or change.chance > settings.LIKELY)
+        more = math.expm1(max(change.error, (abs(change.shift) + 0.5 * change.spread * bool(ground)) * seen))
         growth, unseen = max(growth, more), 0.0
         if change.chance <= settings.LIKELY and more > HIDDEN:
             brighter = f"{100 * math.expm1(change.shift):+.0f} % brighter, which its scatter and moisture may do"
