@@ -21,13 +21,15 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import click
 
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError, StageError, nearest
-from wavebatch.tools.sheets.sheet import Sheet, list_lines
+
+if TYPE_CHECKING:
+    from wavebatch.tools.sheets.sheet import Sheet
 
 _LEVEL, LOG = "wavebatch.log_level", "wavebatch.log_path"
 """Keys of a context's `meta`: the level, and the file of the log."""
@@ -296,6 +298,8 @@ def print_safely(text: str) -> bool:
 
 def print_sheet(sheet: Sheet) -> None:
     """A result as text on stdout."""
+    from wavebatch.tools.sheets.sheet import list_lines
+
     print_text("\n".join(printable(part) for line in list_lines(sheet) for part in line.split("\n")))
 
 

@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -27,7 +27,9 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
 from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.files.text_file import find_files
-from wavebatch.tools.sheets.sheet import Part
+
+if TYPE_CHECKING:
+    from wavebatch.tools.sheets.sheet import Part
 
 _Options = TypeVar("_Options")
 

@@ -32,16 +32,13 @@ _WORDS = ("and", "or", "not")
 _FOREIGN = {"=": "==", "&": "and", "&&": "and", "|": "or", "||": "or", "!": "not", "<>": "!=", "~": "not"}
 """What other languages write, and what is meant here."""
 
-_TOKEN = re.compile(
-    r"""\s*(?:
+_TOKEN = r"""(?x)\s*(?:
     (?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?![\w.]))
     |(?P<name>[^\W\d]\w*)
     |(?P<quoted>`[^`]+`|"[^"]+"|'[^']+')
     |(?P<sign>==|!=|<=|>=|<>|&&|\|\||[-+<>()=&|!~])
     |(?P<end>$)
-    )""",
-    re.VERBOSE,
-)
+    )"""
 
 Truth = tuple[np.ndarray, np.ndarray]
 """Points for which a part is true, and those for which it is false, bool (n,) each; neither: no data."""
@@ -137,7 +134,7 @@ class _Parser:
         return tree
 
     def _advance(self) -> None:
-        found = _TOKEN.match(self._text, self._at)
+        found = re.compile(_TOKEN).match(self._text, self._at)
         if found is None:
             rest = self._text[self._at :]
             self._place = self._at + len(rest) - len(rest.lstrip()) + 1

@@ -45,9 +45,9 @@ _METRES_PER_DEGREE = 111_320.0
 _LONGEST_STRIP = 150_000.0
 """Longest side of a strip whose extent is believed: one point at the origin makes that of a UTM zone longer."""
 
-_CODE = re.compile(
-    r"urn:(?:x-)?ogc:def:crs:(\w+):[^:]*:(\w+)|https?://www\.opengis\.net/def/crs/(\w+)/[^/]*/(\w+)|(EPSG|OGC):(\w+)",
-    re.IGNORECASE,
+_CODE = (
+    r"(?i)urn:(?:x-)?ogc:def:crs:(\w+):[^:]*:(\w+)|https?://www\.opengis\.net/def/crs/(\w+)/[^/]*/(\w+)|"
+    r"(EPSG|OGC):(\w+)"
 )
 """A CRS by its code as GDAL, QGIS and OGC write it: as a URN, as an address, or EPSG:n."""
 
@@ -83,7 +83,7 @@ def read_crs_name(path: Path | str, member: Any) -> str | None:
         name = str(member["properties"]["name"]).strip()
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its member crs has no name; write it in WGS 84, without that member") from error
-    found = _CODE.fullmatch(name)
+    found = re.fullmatch(_CODE, name)
     return ":".join(part.upper() for part in found.groups() if part) if found else name
 
 

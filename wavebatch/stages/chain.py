@@ -46,8 +46,8 @@ KINDS: dict[str, tuple[tuple[str, ...], type]] = {
 
 Needs = tuple[str, ...] | Callable[[Mapping[str, Any]], tuple[str, ...]]
 
-_SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.MULTILINE)
-_ENTRY = re.compile(r"^(\w+)(?: :.*)?$", re.MULTILINE)
+_SECTION = r"(?m)^(\w[\w ]*)\n-{3,}$"
+_ENTRY = r"(?m)^(\w+)(?: :.*)?$"
 """Heading of a section of a numpydoc docstring, and of a parameter in it."""
 
 
@@ -214,7 +214,7 @@ class _Signature(Mapping[str, Parameter]):
 def _declare(name: str, source: Callable | type, defaults: Mapping[str, Any]) -> dict[str, Parameter]:
     """Parameters from the annotations and the docstring of a function or dataclass."""
     hints = typing.get_type_hints(source, include_extras=True)
-    _, *entries = _ENTRY.split(_split_docstring(source)[1].get("Parameters", ""))
+    _, *entries = re.split(_ENTRY, _split_docstring(source)[1].get("Parameters", ""))
     meanings = {head: " ".join(text.split()) for head, text in zip(entries[::2], entries[1::2], strict=True)}
     parameters = {}
     for key, default in defaults.items():
@@ -228,7 +228,7 @@ def _declare(name: str, source: Callable | type, defaults: Mapping[str, Any]) ->
 
 def _split_docstring(function: Callable | type) -> tuple[str, dict[str, str]]:
     """Text before the first section of a numpydoc docstring, and the text of each section."""
-    prose, *rest = _SECTION.split(inspect.getdoc(function) or "")
+    prose, *rest = re.split(_SECTION, inspect.getdoc(function) or "")
     return prose.strip(), {title: body.strip("\n") for title, body in zip(rest[::2], rest[1::2], strict=True)}
 
 

@@ -22,7 +22,6 @@ from wavebatch.surveying.calibration import Calibration, needs_sensor
 from wavebatch.surveying.choose_chain import ChainChoice, Request, make_choice
 from wavebatch.surveying.look import check_saved
 from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
-from wavebatch.surveying.matching.strip_match import match_strip
 from wavebatch.surveying.measuring.return_scatter import measure_returns
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 
@@ -135,6 +134,8 @@ def prepare(
         sent = take_energies(reader, scan, energy, calibration)
     if calibration is None:
         return Setup(choice, source, None, sent, (), stranger, forced)
+    from wavebatch.surveying.matching.strip_match import match_strip
+
     level = None if sent.energy is None else sent.energy.level
     fitted, doubts = match_strip(calibration, reader, scan, system, source, choice.chain, air, level)
     return Setup(choice, source, sent.widen(fitted), sent, doubts, stranger, forced)

@@ -62,13 +62,11 @@ FOOT = 0.3048
 LEAST_OVERLAPS = 3
 """Smallest number of overlapping windows whose positions show by how much the motion leaves the fits' polynomials."""
 
-MERCATOR = re.compile(
-    r'(?:projection|method)\s*\[\s*"(?:mercator(?!.{1,2}variant.c)|popular)|^epsg:(?:3857|3785|3395)\b', re.IGNORECASE
-)
+MERCATOR = r'(?i)(?:projection|method)\s*\[\s*"(?:mercator(?!.{1,2}variant.c)|popular)|^epsg:(?:3857|3785|3395)\b'
 """WKT, or code, of the projections of web maps and sea charts, whose metres are those on the ground at one latitude
 only. Variant C counts its northings from anywhere; of other codes the parameters are not known here."""
 
-SCALING = re.compile(r'(standard|scale|false).(?:parallel|factor|northing)[^"]*"\s*,\s*([-+.\de]+)', re.IGNORECASE)
+SCALING = r'(?i)(standard|scale|false).(?:parallel|factor|northing)[^"]*"\s*,\s*([-+.\de]+)'
 """Parameters of a WKT that say at which latitude that is, and from where northings count."""
 
 EARTH, FLAT, STRETCHED, OFF_LINE = 6_378_137.0, 0.00669, 0.01, 1e-3
@@ -331,8 +329,9 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
         if not unit.is_metric:
             why = "which have no height" if unit.kind == "geocentric" else "so ranges would not be in metres"
             raise InputError(f"{path}: coordinates are {unit.describe()}, {why}: {remedy}")
-    if projection := MERCATOR.search(reader.facts.crs or ""):
-        given = {name.lower(): float(value) for name, value in SCALING.findall(projection.string, projection.end())}
+    text = reader.facts.crs or ""
+    if projection := re.search(MERCATOR, text):
+        given = {name.lower(): float(value) for name, value in re.findall(SCALING, text[projection.end() :])}
         sine = np.sin(np.radians(given.get("standard", 0.0)))
         least = given.get("scale", 1.0) * ((1.0 - sine**2) / (1.0 - FLAT * sine**2)) ** 0.5
         low, high = (ends[1] - given.get("false", 0.0) for ends in (reader.facts.header.mins, reader.facts.header.maxs))

@@ -23,7 +23,6 @@ from wavebatch.files.text_file import find_strips
 from wavebatch.files.trajectory_file import check_trajectory
 from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages.chain import Chain, list_profiles, load_chain_file, load_profile
-from wavebatch.surveying.calibrating.calibration_files import load_calibration
 from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, choose_chain, widest_chain
 from wavebatch.surveying.sensor import SensorRequest
@@ -180,6 +179,11 @@ def plan_run(
         check_attenuation(attenuation)
     if attenuation is not None:
         air = (float(attenuation), float(options.attenuation_error or 0.0))  # [dB/km] and its error
+    calibration = None
+    if options.calibration is not None:
+        from wavebatch.surveying.calibrating.calibration_files import load_calibration  # most runs have none
+
+        calibration = load_calibration(Path(options.calibration))
     template = StripJob(
         Path(),
         asked_chain,
@@ -187,7 +191,7 @@ def plan_run(
         tuple(entry.removeprefix("+") for entry in split_columns(options.columns) if entry.strip(" +")),
         request,
         read_sensor(options),
-        None if options.calibration is None else load_calibration(Path(options.calibration)),
+        calibration,
         air,
         PointFilter.build(drop_flags=options.drop_flags, classes=options.classes, bbox=options.bbox,
                           polygon=options.polygon, where=options.where),

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,8 +20,10 @@ from wavebatch.core.condition import Condition, parse_condition, read_flags
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
-from wavebatch.files.geojson import Polygon, describe_miss, find_inside, load_polygons
 from wavebatch.files.las.header import LasHeader
+
+if TYPE_CHECKING:
+    from wavebatch.files.geojson import Polygon
 
 REASONS = ("drop_flags", "flags", "classes", "bbox", "polygon", "where")
 """Why a point is left out, in the order of the tests: it counts for the first one that it does not meet."""
@@ -83,8 +85,12 @@ class PointFilter:
         if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
             order = "must be west, south, east, north, with west < east and south < north"
             raise ConfigError(f"--bbox: {','.join(f'{edge:.15g}' for edge in box)} {order}")
-        polygons, file = () if polygon is None else tuple(load_polygons(polygon)), None
+        polygons: tuple[Polygon, ...] = ()
+        file = None
         if polygon is not None:
+            from wavebatch.files.geojson import load_polygons  # most runs have none
+
+            polygons = tuple(load_polygons(polygon))
             # What decides where they lie, besides the header of the strip, which --resume compares too.
             corners = b"".join(ring.tobytes() + b"|" for one in polygons for ring in one.rings)
             crs = next((one.file.crs for one in polygons if one.file is not None), None)
@@ -151,7 +157,12 @@ class PointFilter:
         """Say that box and placed polygons lie outside a strip by its header; empty where they do not."""
         areas = [[ring for polygon in self.polygons for ring in polygon.rings]]
         areas += [] if self.bbox is None else [[np.array(self.bbox).reshape(2, 2)]]
-        return next(filter(None, (describe_miss(area, header) for area in areas if area)), "")
+        areas = [area for area in areas if area]
+        if not areas:
+            return ""
+        from wavebatch.files.geojson import describe_miss
+
+        return next(filter(None, (describe_miss(area, header) for area in areas)), "")
 
 
 EVERY = PointFilter()
@@ -216,6 +227,8 @@ class PlannedFilter:
                 west, south, east, north = chosen.bbox
                 yield "bbox", (x >= west) & (x <= east) & (y >= south) & (y <= north)
             if chosen.polygons:
+                from wavebatch.files.geojson import find_inside
+
                 inside = [find_inside(one.rings, x, y) for one in chosen.polygons]
                 yield "polygon", np.logical_or.reduce(inside)
         if chosen.where is not None:

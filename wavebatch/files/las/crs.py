@@ -264,9 +264,7 @@ def build_utm(code: int) -> str | None:
     return None
 
 
-_TOKEN = re.compile(
-    r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)\s*([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+|(.)', re.DOTALL
-)
+_TOKEN = r'(?s)"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)\s*([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+|(.)'
 
 
 @dataclass(slots=True, eq=False)
@@ -292,7 +290,7 @@ def read_wkt(text: str) -> list[Node]:
     """Return all nodes of WKT (version 1 or 2) in the order of the text; empty where it is not well formed."""
     found: list[Node] = []
     nested: list[Node] = []
-    for token in _TOKEN.finditer(text):
+    for token in re.finditer(_TOKEN, text):
         quoted, word, opens, number, closes, other = token.groups()
         if opens:
             found.append(Node(word.upper(), token.start()))
@@ -311,9 +309,7 @@ def read_wkt(text: str) -> list[Node]:
 LONGEST_WKT = 1 << 20
 """Longest record that is read as a WKT: those of real files have a few kilobytes."""
 
-_METRE_UNIT = re.compile(
-    r'UNIT\s*[\[(]\s*"(?:met(?:er|re)s?|m)"\s*,\s*\+?0*1(?:\.0*)?(?:E[-+]?0+)?\s*[,\])]', re.IGNORECASE
-)
+_METRE_UNIT = r'(?i)UNIT\s*[\[(]\s*"(?:met(?:er|re)s?|m)"\s*,\s*\+?0*1(?:\.0*)?(?:E[-+]?0+)?\s*[,\])]'
 _DEGREE = 'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]]'
 
 
@@ -336,7 +332,7 @@ def repair_wkt(wkt: str) -> str:
         if len(units) != 1:
             continue
         start, end = units[0].start, units[0].end
-        if _METRE_UNIT.match(wkt, start, end):
+        if re.compile(_METRE_UNIT).match(wkt, start, end):
             repaired = repaired[:start] + _DEGREE + repaired[end:]
     return wkt if repaired == wkt else drop_empty_codes(repaired)
 
@@ -446,12 +442,12 @@ def metres_per_unit(units: Sequence[CrsUnits]) -> tuple[float, float, float]:
     return along, along, up
 
 
-_EPSG = re.compile(r'(?:AUTHORITY|ID)\s*\[\s*"EPSG"\s*,\s*"?(\d+)"?\s*\]\s*\]\s*$')
+_EPSG = r'(?:AUTHORITY|ID)\s*\[\s*"EPSG"\s*,\s*"?(\d+)"?\s*\]\s*\]\s*$'
 
 
 def find_epsg(wkt: str) -> int | None:
     """Return the EPSG code of the CRS that a WKT describes; None where it gives none, or 0 as RiPROCESS does."""
-    found = _EPSG.search(wkt)
+    found = re.search(_EPSG, wkt)
     return int(found[1]) or None if found else None
 
 
