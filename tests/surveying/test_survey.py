@@ -116,6 +116,8 @@ def test_copies_of_a_waveform_count_once():
     assert np.array_equal(one.samples, block.samples) and rises.sum() > 400
     assert len(joined) == len(block) + 2 * (~rises).sum()
     assert np.array_equal(np.unique(joined.samples, axis=0), np.unique(block.samples, axis=0))
+    said = {decision.part: decision.reason for decision in survey_blocks([copies], learn=False).decisions}
+    assert said["copies count once"].startswith(f"{len(copies) - len(joined)} of {len(copies)} waveforms")
 
 
 @pytest.mark.slow

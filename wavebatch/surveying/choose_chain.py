@@ -212,7 +212,8 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
     ConfigError
         Where no shipped chain meets the tolerance.
     """
-    sample = read_sample(reader, scan) if request.system is None or request.tolerance is not None else []
+    needs_sample = request.system is None or request.tolerance is not None
+    sample = list(reader.sample_blocks(scan, reader.sample_size(scan))) if needs_sample else []
     if request.system is None:
         from wavebatch.surveying.outgoing import compare_outgoing  # these and what they import: 10 ms
         from wavebatch.surveying.survey import survey_blocks
@@ -220,14 +221,13 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
         found = compare_outgoing(survey_blocks(sample), reader.facts.path)
     else:
         found = request.system.survey
-    block = sample[0] if sample else None
     if request.tolerance is not None:
         from wavebatch.surveying.predict_error import leave_out_false, predict_errors
 
         chains = {name: load_profile(name) for name in COSTS}
-        if block is None:
+        if not sample:
             return ChainChoice(chains[COSTS[0]], found)
-        predictions = predict_errors(block, found.system, chains)
+        predictions = predict_errors(join_digitizers(sample)[0], found.system, chains)
         fitting = leave_out_false(predictions)
         good = [prediction for prediction in fitting if prediction.range_error <= request.tolerance]
         if not good:

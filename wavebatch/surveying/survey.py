@@ -91,6 +91,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True, errors
     A descriptor is not a digitizer: descriptors that differ in the number of samples only are surveyed together,
     unless their level, noise or clipping differ by more than chance (`find_strangers`).
     """
+    blocks = list(blocks)
     joined = join_digitizers(blocks)
     if not joined:
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
@@ -143,6 +144,9 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True, errors
     for length, at in sorted(seams.items()):
         reason = f"packets of {length} samples are interpolated at sample {at}: two recordings meet there"
         decisions.append(Decision("seam left out", True, reason))
+    if copies := sum(map(len, blocks)) - sum(map(len, joined)):
+        reason = f"{copies} of {sum(map(len, blocks))} waveforms are copies of others, and show nothing more"
+        decisions.append(Decision("copies count once", True, reason))
     system = replace(found.system, seams=seams, digitizers=systems)
     return replace(found, system=system, decisions=tuple(decisions))
 
