@@ -17,7 +17,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.detect.direct import matched_filter, maximum
 from wavebatch.stages.score import match_echoes
-from wavebatch.surveying.measuring.judge import SEARCH, Explained
+from wavebatch.surveying.measuring.judge import SEARCH, SURE, Explained
 from wavebatch.surveying.measuring.misfit import MOST_FAINT
 from wavebatch.surveying.measuring.noise_and_width import HOLDS
 from wavebatch.surveying.measuring.residuals import find_echoes
@@ -86,9 +86,10 @@ def look_in_mirror(
     mains = echoes.take(np.flatnonzero(strong))
     # Of the energy of echoes, as a decomposition asks for it, in standard deviations of noise.
     unit, false = np.sqrt(SQRT_PI / block.spacing) / system.noise.std, []
-    # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse.
+    # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse. And their fits
+    # have free levels: in short waveforms of wide pulses what known ones lack became wide echoes.
     for detect in (matched_filter, maximum):
-        other = find_echoes(mirrored, system, detect, **SEARCH)[2]
+        other = find_echoes(mirrored, system, detect, **SEARCH | {"free_levels": True})[2]
         alone = np.ones(len(other), bool)
         alone[match_echoes(other, echoes, SAME * width).found] = False
         rest = other.take(np.flatnonzero(alone))
@@ -128,7 +129,12 @@ def count_holes(system: SystemPulse, explained: Explained, spacing: float) -> in
     near = np.clip(place[:, None] + np.arange(-reach, reach + 1), 0, middle.shape[1] - 1)
     highest = sums.model[row[:, None], near].max(axis=1, initial=0.0)
     noise = HOLDS * np.sqrt((system.noise.std**2 + system.noise.gain * highest) / energy)
-    return int(np.count_nonzero(middle[row, place] > np.maximum(noise, LACK * highest)))
+    deep = middle[row, place] > np.maximum(noise, LACK * highest)
+    # Undershoots follow the strong echo that makes them. Noise makes as many holes before it: more are not counted.
+    strong = np.where(top[:, 0] > 0, (sums.model >= 0.5 * top).argmax(axis=1), middle.shape[1])
+    number = np.count_nonzero(deep & (place < strong[row]))
+    most = (number + SURE * np.sqrt(number + 1)) * middle.size / max(strong.sum(), 1)
+    return int(min(np.count_nonzero(deep), most))
 
 
 def _lie_far(rest: EchoTable, echoes: EchoTable, reach: float) -> np.ndarray:
