@@ -159,13 +159,17 @@ def test_echoes_beside_stronger_ones_at_one_lag_and_ratio_are_counted_beyond_cha
 
 @pytest.mark.parametrize(
     ("lag", "scatter", "share"),
-    [(7, 0.1, 0.47), (90, 0.1, 0.47), (2.7, 0.1, 0.47), (-3.3, 0.1, 0.47), (7, 0.3, 0.18), (2.7, 0.5, 0), (None, 0, 0)],
-)
+    [(7, 0.1, 0.47), (90, 0.1, 0.47), (2.7, 0.1, 0.47), (-3.3, 0.1, 0.47), (7, 0.3, 0.18), (2.7, 0.5, 0), (None, 0, 0),
+     (2.3, 0.1, 0.47), (-2.3, 0.1, 0.47), (None, 0.2, 0), (None, 0.5, 0), (None, -0.5, 0)],
+)  # fmt: skip
 def test_echoes_at_one_lag_are_counted_whatever_their_ratio(rng, lag, scatter, share):
     """Second pulses whose height changes from shot to shot, three widths or a hundred later, made 19 to 39 % of the
-    echoes false, without a word. A layer below all echoes scatters by more than a part of a pulse."""
+    echoes false, without a word. A layer below all echoes scatters by more than a part of a pulse. Plants right over
+    the ground have the least lag that is told apart, and larger ones: 16 to 25 % were doubted."""
     n = 400
-    after = rng.exponential(8, n) + 1 if lag is None else lag + scatter * rng.standard_normal(n)
+    after = 1 + rng.exponential(8, n) if lag is None else lag + scatter * rng.standard_normal(n)
+    if lag is None and scatter:
+        after = np.sign(scatter) * (1.9 + np.abs(rng.exponential(abs(scatter), n)))
     time = np.r_[np.full(n, 30.0), 30 + 2 * after]
     height = 100 * np.r_[np.ones(n), np.exp(rng.uniform(np.log(0.01), np.log(0.24), n))]
     echoes = EchoTable.build(np.tile(np.arange(n), 2), time, height, np.full(2 * n, 2.0))

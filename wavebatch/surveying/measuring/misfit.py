@@ -114,10 +114,11 @@ beyond which some are none: in simulated scenes .15 at most, with pulses whose s
 WEAKER, REACH = 0.5, 15
 """Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
 
-NEAREST, SAME_LAG, ASIDE = 2.0, 0.25, (-1.0, -0.5, 0.5, 1.0)
+NEAREST, SAME_LAG, ASIDE, MERGED = 2.0, 0.25, (-1.0, -0.5, 0.5, 1.0), 2.75
 """Distance from which echoes of one lag, half as high as WEAKER at most, are counted: nearer ones merge. Distance up to
 which lags are the same, as errors of the faintest echoes scatter them, and lags beside it where others are as often:
-layers of a scene that scatter by .3 are there too [system widths]."""
+layers of a scene that scatter by .3 are there too. And distance below which the nearer of these merge [system
+widths]."""
 
 SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
 """Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
@@ -285,11 +286,20 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
     lag = np.sort(np.concatenate(weak))
     first, last = (lag[0], lag[-1]) if len(lag) else (0.0, 0.0)
     centre = np.arange(first, last + SAME_LAG, SAME_LAG / 2)
-    place = centre[np.abs(centre) >= NEAREST, None] + np.array([0.0, *ASIDE])
+    centre = centre[np.abs(centre) >= NEAREST]
+    place = centre[:, None] + np.array([0.0, *ASIDE])
     number = np.searchsorted(lag, place + SAME_LAG) - np.searchsorted(lag, place - SAME_LAG)
-    beside = number[:, 1:].max(axis=1)
+    beside = variance = number[:, 1:].max(axis=1)
+    # Nearer ones merge there. Plants right over the ground are as many more as these are than those a step further.
+    first, second = np.where(centre > 0, number[:, 3:].T, number[:, 2:0:-1].T)
+    fallen = first**2 / np.maximum(second, 1)
+    beside, variance = np.where(
+        (np.abs(centre) < MERGED) & (fallen > beside),
+        (fallen, fallen**2 * (4 / np.maximum(first, 1) + 1 / np.maximum(second, 1))),
+        (beside, variance),
+    )
     more = number[:, 0] - beside
-    more = more[(more >= FEW) & (more > SURE * np.sqrt(number[:, 0] + beside))]
+    more = more[(more >= FEW) & (more > SURE * np.sqrt(number[:, 0] + variance))]
     return max(most, float(more.max(initial=0))) / max(len(echoes), 1)
 
 
