@@ -330,6 +330,24 @@ def test_a_pulse_looks_too_good_to_the_waveforms_that_taught_it(errors, small, d
 
 
 @pytest.mark.parametrize(
+    ("repeated", "answered", "errors", "taken", "spread"),
+    [(1.0, 400, 0, "half", 0.5**0.5), (1.0, 400, 1, "half", 0.614), (1.05, 400, 2.9, "half", 0.12),
+     (2.0, 400, 0, "right", 0), (0.92, 400, 2, "right", 0), (2.0, 100, 0, "half", 0.5**0.5), (2.0, 400, 4, "half", 0)],
+)  # fmt: skip
+def test_a_pulse_whose_echoes_repeat_another_width_must_be_shorter_for_sure(repeated, answered, errors, taken, spread):
+    """Than one whose echoes agree with it, and that sees them. Widths of others count as likely as they are."""
+    more = 0.5 * np.resize([1.0, -1.0], 400)
+    half, right = (
+        choose_pulse.Candidate(name, SystemPulse(width), 0.0, 50 + more, echoes, seen, False, 1, 0.0, own)
+        for name, width, more, echoes, seen, own in (
+            ("half", 1.0, 0 * more, 390, 400, repeated), ("right", 2.0, errors * 0.025 + more, 400, answered, 1.0)
+        )
+    )  # fmt: skip
+    choice = choose_pulse._decide([half, right])
+    assert choice.best.name == taken and choice.spread == pytest.approx(spread, abs=0.005) and len(choice.tried) == 2
+
+
+@pytest.mark.parametrize(
     ("n", "seed", "gaps", "echoes", "number", "taken"),
     [(160, 1, (1.2, 2.5), 3, 10, 9), (160, 1, (1.2, 2.5), 6, 6, 4), (40, 10, (1.2, 2.5), 3, 4, 3)],
 )

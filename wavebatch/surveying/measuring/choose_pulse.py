@@ -18,7 +18,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, quantile
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import log
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.describe import describe_left
 from wavebatch.stages.pulse_tables import clip_level, shape_limits
 from wavebatch.surveying.measuring.joint_pulse import MOST_ECHOES, learn_jointly
@@ -78,6 +78,11 @@ LEAST_SAVED, LEAST_OF_KNOWN, OTHER_WIDTH = 0.25, 2.0, 0.1
 chi2 of a half and of 4, of which an echo alone tells nothing. What a strip's scene has in common is in a pulse that is
 learned from it and in all of its waveforms, and saves some (.2 in a canopy, .3 on RIEGL, 1.1 on LVIS), however many
 tell it. It widens the pulse a little (6 % on LVIS): one that differs by a tenth is that of another sensor."""
+
+LEAST_REPEATED = 1.005 * STRICT
+"""Width that strong echoes repeat, over the pulse's, from which it may be theirs: most of those of a pulse that is too
+wide are STRICT. They may repeat OTHER_WIDTH more: in a canopy hardly one is level. Of pulses half as wide as the right
+one, which describe canopies as short, they repeat 1.5 to 4 times the width."""
 
 BLIND = 2 / 3
 """Waveforms in which a pulse finds an echo, over those of another one, from which that it needs fewer echoes says
@@ -147,6 +152,8 @@ class Candidate:
     """Of the pulse, as far as they had to be learned: 2 for one that is known, so that a plain Gaussian goes first."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
+    repeated: float = 1.0
+    """Narrowest width that strong echoes repeat, over that of the pulse: 1 where it is their pulse."""
     as_likely: tuple[float, ...] = ()
     """Echoes with other changes of the shape that cost the same, over its own."""
 
@@ -175,7 +182,7 @@ class Choice:
     doubt: float
     """Share by which the number of echoes differs between candidates that cost the same."""
     spread: float
-    """Share by which their widths differ from that of the best one."""
+    """Share by which their widths differ from that of the best one, as likely as each of them is (root mean square)."""
     tied: bool
     """Whether another pulse, or one that needs another number of echoes, costs the same."""
 
@@ -344,6 +351,7 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     return Candidate(
         name, system, change, length, len(explained.echoes), len(distinct(explained.echoes.waveform)), known,
         2 if known else gaussians, measure_change(borne, explained),
+        find_own_width(explained, shape_limits(borne, block.spacing).ref),
     )
 
 
@@ -395,6 +403,11 @@ def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
 
     Of pulses as simple the one with the fewest echoes, or the shortest description of those within AS_FEW of it.
     """
+    # Echoes that repeat another width than that of their pulse contradict it, unless it is shorter for sure than all
+    # that agree with theirs. Hardly an echo is seen by one that is far too wide: it says nothing.
+    agreed = [one for one in found if LEAST_REPEATED < one.repeated < 1 + OTHER_WIDTH]
+    every, found = found, [one for one in found if one in agreed or not any(
+        each.exceeds(one) < SURE and each.answered >= BLIND * one.answered for each in agreed)]  # fmt: skip
     ordered = []
     for number in sorted({one.gaussians for one in found}):
         alike = [one for one in found if one.gaussians == number]
@@ -420,16 +433,18 @@ def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
     tied += [one for one in rivals if SURE <= one.exceeds(best) < most]
     echoes = [*best.as_likely, *(one.echoes / max(best.echoes, 1) for one in tied)]
     doubt = max(echoes) - min(echoes)
-    widths = [one.system.sigma_ref for one in tied]
-    spread = max(abs(width / best.system.sigma_ref - 1) for width in widths)
+    off = np.array([abs(one.system.sigma_ref / best.system.sigma_ref - 1) for one in tied])
+    longer = np.array([one.exceeds(best) for one in tied])
+    weight = exp(-0.5 * (longer - longer.min()) ** 2)
+    spread = float(np.sqrt(np.sum(weight * off**2) / np.sum(weight)))
     tried = [
         Tried(
             one.name, one.system.sigma_ref * FWHM_PER_SIGMA, max(len(one.system.components), 1), one.change,
             one.typical, one.exceeds(best), one.echoes / len(one.length), one is best,
         )
-        for one in sorted(found, key=lambda one: one.typical)
+        for one in sorted(every, key=lambda one: one.typical)
     ]  # fmt: skip
-    other = any(one.gaussians != best.gaussians for one in tied) or spread > MOST_SPREAD or doubt > 1 - AS_FEW
+    other = any(one.gaussians != best.gaussians for one in tied) or off.max() > MOST_SPREAD or doubt > 1 - AS_FEW
     return Choice(best, tuple(tried), doubt, spread, other)
 
 
