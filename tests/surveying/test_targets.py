@@ -94,6 +94,7 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     found = load_calibration(cal)
     assert found.divergence == 0.5 and 0.03 <= found.relative_error < 0.1
     assert found.strip == "flat.las" and "direction vectors" in found.conditions
+    assert found.conditions.endswith("even light across the swath assumed")
     done = succeed("run", ground, "-o", folder, "--profile", "balanced", "--calibration", cal)
     cloud = laspy.read(next(folder.glob("*.laz")))
     inside = np.hypot(cloud.x - x, cloud.y - y) < 40

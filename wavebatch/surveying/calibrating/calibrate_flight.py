@@ -39,6 +39,9 @@ MOST_TIES = 200_000
 MOST_OF_COLUMN = 20_000
 """Most waveforms of a strip that are decomposed for a column of reflectances, from whole squares as well."""
 
+ONE_VIEW = ", even light across the swath assumed"
+"""Of one strip: it sees each place at one angle, and fields hide what falls from side to side."""
+
 _Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper corner in x and y [m]."""
 
@@ -386,7 +389,7 @@ def calibrate_flight(
     bent = max(one.bent for one in good)
     sources = [Source(strip, row) for strip in strips for row in strip.channels]
     if len(sources) == 1 and not options.scan_angle:
-        return FlightCalibration(good[0].widened(bent))
+        return FlightCalibration(replace(good[0].widened(bent), conditions=good[0].conditions + ONE_VIEW))
     rights = np.array([source.strip.right for source in sources])
     parts = [np.empty(0, adjust.TIE)]
     for number, source in enumerate(sources):
@@ -525,7 +528,9 @@ def _assemble(
         constant=float(np.median(constants)),
         relative_error=error,
         strip=", ".join(strip.path.name for strip in strips),
-        conditions=good[0].conditions if len(strips) == 1 else f"{len(strips)} strips, {good[0].conditions}",
+        conditions=good[0].conditions + ONE_VIEW
+        if len(strips) == 1
+        else f"{len(strips)} strips, {good[0].conditions}",
         targets=tuple(
             # Those without any echo on a strip of several are left out.
             row if len(strips) == 1 else replace(row, name=f"{row.name} on {strip.path.name}")
