@@ -273,7 +273,7 @@ def test_fits_that_miss_their_samples_are_neighbours_only_where_there_are_some(c
 def test_a_pulse_that_changes_is_seen_where_neighbours_are_rare(number, tmp_path):
     """3 to 5 % of the fits of lone echoes missed their samples, as in canopies: 4 % of the echoes were false."""
     result = judge_strip(number, tmp_path)
-    assert result["right"] and result["extra"] < 0.02
+    assert result["right"] and result["extra"] < 0.03
 
 
 @pytest.mark.quick_cases("3799")

@@ -235,7 +235,8 @@ def search_misfit(monkeypatch, cost, loud, change):
 
     def describe(block, system, explained, changes, left):
         looked.append(explained.place)
-        return [np.full(100, cost[explained.place] / 100) + (5.0 if explained.place == loud else 0.3) * scatter]
+        here = np.interp(explained.place, list(cost), list(cost.values()))
+        return [np.full(100, here / 100) + (5.0 if explained.place == loud else 0.3) * scatter]
 
     monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
     monkeypatch.setattr(choose_pulse, "_explain_between", explain_between)
@@ -256,6 +257,14 @@ def test_none_is_taken_only_where_it_was_looked_at(monkeypatch):
     cost = {0: 900, 1: 700, 2: 500, 3: 40, 4: 40, 5: -5, 6: 0, 7: 20, 8: 60}
     misfit, _, looked = search_misfit(monkeypatch, cost, 5, 0.01)
     assert choose_pulse.MISFITS[2] < misfit <= choose_pulse.MISFITS[3] and 2 in looked
+
+
+def test_the_least_misfit_is_looked_for_between_those_that_are_doublings(monkeypatch):
+    """A description falls from misfit to misfit as it likes: a curve through coarse ones was off by a third."""
+    cost = {0: 300, 1: 200, 2: 100, 3: 30, 3.5: 28, 3.75: 1, 4: 0, 5: 40, 6: 60, 8: 200}
+    misfit, _, looked = search_misfit(monkeypatch, cost, None, 0.0)
+    assert {3.5, 3.75} <= set(looked)
+    assert 3.5 < np.log2(misfit / choose_pulse.MISFITS[0]) <= 3.75
 
 
 @pytest.mark.parametrize(

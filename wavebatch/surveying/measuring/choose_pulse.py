@@ -106,6 +106,10 @@ start: they had 3 to 5 % of false echoes in place of 1 to 2."""
 MISFITS = LEAST_MISFIT * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried, up to MOST_MISFIT."""
 
+FINEST = 0.25
+"""Part of a doubling to which the least misfit is looked for where descriptions begin to be as short: between misfits
+further apart their standard errors are no line, and no parabola."""
+
 STACKED, JOINTLY = "lone echoes", "lone echoes, jointly"
 OF_ALL, OF_ANY, AGAIN = "gaussian of all echoes", "all echoes", ", again"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, OF_ANY: {}}
@@ -541,22 +545,23 @@ def _choose_misfit(
     """The least misfit that describes in at most one standard error more than the shortest, its doubt, and its echoes.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
-    much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
-    found by their standard errors: halves of a strip then agree. The doubt is the share by which the number of echoes
-    differs between misfits whose descriptions are longer by at most one.
+    much of it neighbours are not found, and both lengthen the description. Where it begins to be as short, steps are
+    halved down to FINEST; between the last two it is found by their standard errors: halves of a strip then agree.
+    The doubt is the share by which the number of echoes differs between misfits whose descriptions are longer by at
+    most one.
     """
     changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
     found: dict[float, Looked] = {}
-    lengths: dict[int, np.ndarray] = {}
+    lengths: dict[float, np.ndarray] = {}
 
     def at(misfit: float) -> SystemPulse:
         return replace(system, misfit=float(misfit))
 
-    def look(*places: int) -> tuple[int, list[float]]:
+    def look(*places: float) -> tuple[float, list[float]]:
         """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
         for place in places:
             if place not in found:
-                found[place] = _explain_between(block, at(MISFITS[place]), changes, found, place)
+                found[place] = _explain_between(block, at(MISFITS[0] * 2.0**place), changes, found, place)
             if place not in lengths:
                 looked = found[place]
                 lengths[place] = describe_waveforms(block, system, looked.explained, changes, looked.left)
@@ -584,6 +589,12 @@ def _choose_misfit(
     while longer[0] <= 1 and min(lengths) > 0:  # what was looked at last may be the shortest
         best, longer = look(min(lengths) - 1)
     places = sorted(lengths)
+    while longer[0] > 1:
+        first = next(place for place, errors in enumerate(longer) if errors <= 1)
+        if places[first] - places[first - 1] <= FINEST:
+            break
+        best, longer = look((places[first - 1] + places[first]) / 2)
+        places = sorted(lengths)
     between = np.linspace(places[0], places[-1], 8 * len(MISFITS))
     numbers = np.interp(between, places, [len(found[place].explained.echoes) for place in places])
     as_likely = numbers[np.interp(between, places, longer) <= 1]
@@ -591,10 +602,9 @@ def _choose_misfit(
     misfit = 0.0
     if longer[0] > 1:
         first = next(place for place, errors in enumerate(longer) if errors <= 1)
-        before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
-        # Near its least a length is a parabola.
-        over, under = np.sqrt(longer[first - 1]), np.sqrt(max(longer[first], 0.0))
-        misfit = float(before * (after / before) ** ((over - 1) / (over - under)))
+        over, under = longer[first - 1 : first + 1]
+        share = (over - 1) / (over - under)
+        misfit = float(MISFITS[0] * 2.0 ** (places[first - 1] + share * (places[first] - places[first - 1])))
     # In a canopy neighbours are in the stack too: no more than descriptions allow.
     allowed = between[np.interp(between, places, longer) <= SURE]
     misfit = max(misfit, min(missed, float(MISFITS[0] * 2.0 ** max(allowed, default=0.0))))

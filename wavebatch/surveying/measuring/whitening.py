@@ -10,6 +10,7 @@ import numpy as np
 from wavebatch.core.order import median
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.stages.pulse_tables import noise_factors, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.judge import (
@@ -124,7 +125,7 @@ def choose_whitening(
     block : WaveformBlock
         A sample of the strip.
     system : SystemPulse
-        Its pulse and noise.
+        Its pulse and noise, with the misfit that the change asks for: a filter for noise makes changes into echoes.
     change : float
         Of the pulse from shot to shot, as a share of its amplitude.
     seen : (SystemPulse, Explained), optional
@@ -155,7 +156,16 @@ def choose_whitening(
     error = MEDIAN_ERROR * MAD_TO_STD * median(np.abs(left - typical)) / np.sqrt(len(left))
     if typical - error > MOST_LEFT:
         return plain
-    # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.
-    length = describe_waveforms(block, whitened, explain(block, whitened), [change])[0]
+    found = explain(block, whitened)
+    length = describe_waveforms(block, whitened, found, [change])[0]
     other = describe_waveforms(block, plain, explained, [change])[0]
+    # An echo costs the logarithm of what can be known of it: the larger errors of fits that take coloured noise for
+    # white are paid in what they leave, and must not make their description shorter.
+    number, same = (one.echoes.count(len(block)) for one in (explained, found))
+    single = np.flatnonzero((number == 1) & (same == 1))
+    for error in ("time_err", "amplitude_err", "sigma_err"):
+        known = (getattr(one.echoes, error)[np.isin(one.echoes.waveform, single)] for one in (explained, found))
+        ratio = np.divide(*known).astype(np.float64)
+        if (ratio > 0).any():
+            other += number * log(max(median(ratio[ratio > 0]), 1.0))
     return whitened if exceed(length, other) <= SURE else plain
