@@ -8,7 +8,7 @@ from published import PULSE_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse, fit_one_gaussian, tabulate_pulse
 from wavebatch.stages.chain import STAGES, Step
-from wavebatch.stages.decompose.models import rebuild_waveforms
+from wavebatch.stages.decompose.models import echo_pulses, rebuild_waveforms
 from wavebatch.stages.pulse_tables import ShapeLimits, model_parameters
 
 FINE = 100.0
@@ -123,6 +123,9 @@ def test_generalized_gaussians_fit_flat_and_peaked_echoes(power):
     share = np.array([0.0, 1 / 200, 1 / 3.0])
     expected = 0.5 * np.sqrt(share @ np.linalg.inv(slopes @ slopes.T) @ share)
     assert np.median(found.relative_energy_err) == pytest.approx(expected, rel=0.02)
+    drawn = rebuild_waveforms(block, system, Step(STAGES["decompose.generalized_gaussian"]), found)
+    assert np.abs(drawn - (block.samples - 2000.0)).max() < 0.02 * 200 * FINE
+    np.testing.assert_allclose(echo_pulses(PulseShape(), system, 1.0, found)(x), drawn, atol=1e-3 * FINE)
     if power != 2.0:
         assert np.median(decompose("gaussian", block, noise, system).residual) > 3
 

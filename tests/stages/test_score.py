@@ -111,10 +111,10 @@ def test_isolated_means_alone_inside_and_not_clipped():
 
 
 def test_statistics_of_known_errors():
-    stats = ErrorStats.compute(np.array([1.0, -1.0, 3.0]), np.array([0.5, 0.5, 0.5]), np.array([1.0, np.nan, 1.0]))
+    stats = ErrorStats.compute(np.array([1.0, -1.0, 3.0]), np.array([0.5, 0.5, 0.5]), np.array([2.0, np.nan, 2.0]))
     assert stats.number == 3
     assert stats.bias == pytest.approx(1.0)
     assert stats.rmse == pytest.approx(np.sqrt(11 / 3))
     assert stats.nmad == pytest.approx(1.4826 * 2)
     assert stats.rms_per_bound == pytest.approx(2 * np.sqrt(11 / 3))
-    assert stats.calibration == pytest.approx(np.sqrt(5))
+    assert stats.calibration == pytest.approx(np.sqrt(5) / 2)

@@ -14,6 +14,8 @@ from wavebatch.files.las.header import read_header
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.file_facts import describe_file
 
+pytestmark = pytest.mark.kept_surveys
+
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 
 

@@ -13,6 +13,8 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.measuring.return_scatter import ReturnScatter, _measure, _sample, measure_returns
 
+pytestmark = pytest.mark.kept_surveys
+
 TOWN = [*roofs([0, 20, 38, 55]), Plane(0.25)]
 HILL = [Plane(slope=(np.tan(np.radians(22.0)), 0.1))]
 def measure(path):

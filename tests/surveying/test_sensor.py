@@ -30,6 +30,8 @@ from wavebatch.surveying.sensor import (
 )
 from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
+pytestmark = pytest.mark.kept_surveys
+
 
 def find(path, **request):
     with StripReader(path) as reader, reader.scan() as scan:

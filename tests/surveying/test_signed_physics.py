@@ -14,6 +14,8 @@ from footprints import Flight, Plane, match, roofs, write_strip
 
 from wavebatch.surveying.systems.survey_result import load_survey
 
+pytestmark = pytest.mark.kept_surveys
+
 GREEN = Flight()
 HILLSIDE = Plane(slope=(np.tan(np.radians(22.0)), 0.1))
 

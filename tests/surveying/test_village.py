@@ -24,6 +24,8 @@ from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.render import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT, simulate_seed_block
 
+pytestmark = pytest.mark.kept_surveys
+
 SCENE = find_scene("village")
 
 

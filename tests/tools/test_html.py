@@ -113,6 +113,7 @@ def test_the_page_of_a_calibration(tmp_path):
     page.write_page(tmp_path / "c.html", "calibrate", calibration_page(FlightCalibration(found, pairs)))
     shown = Page(tmp_path / "c.html").check()
     assert "0.las / 1.las" in shown.text and shown.row("roof <i>")[2] == "50" and shown.row("lake")[-1] == "too few"
+    assert "1: 0.las 1/0, 2: 1.las 1/0, 3: 2.las 1/0" in shown.text
     assert "constants differ" in shown.text and shown.row("day of the flight")[1] == "not in the strip"
 
 
