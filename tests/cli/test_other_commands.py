@@ -232,6 +232,7 @@ def test_the_sensor_that_a_pulse_looks_like_is_named(riegl, flat_strip, tmp_path
     assert used in small and "riegl-q680i: " in small
     assert "looks like" not in _survey(flat_strip).stdout
     assert sentence in succeed("info", "-v", riegl).stdout
+    assert json.loads(succeed("info", "-v", "--json", riegl).stdout)["pulse"]["sensor"] == "RIEGL LMS-Q680i"
     assert "pulse   " not in run_command("info", riegl).stdout
     other = json.loads(run_command("info", "-v", "--json", flat_strip).stdout)
     assert other["pulse"]["sensor"] is None and other["pulse"]["full_width_ns"] == pytest.approx(4.71, rel=0.03)

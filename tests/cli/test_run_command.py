@@ -94,7 +94,9 @@ def test_progress_as_json_lines(tiny_strip, tmp_path):
 
 
 def test_a_bar_on_request(tiny_strip, tmp_path):
-    result = _run(tiny_strip, "-o", tmp_path, "--progress", "bar", "--profile", "fast")
+    """Into a folder that is there, whatever its name."""
+    (tmp_path / "out.las").mkdir()
+    result = _run(tiny_strip, "-o", tmp_path / "out.las", "--progress", "bar", "--profile", "fast")
     assert result.exit_code == 0 and "100%" in result.stderr
 
 
