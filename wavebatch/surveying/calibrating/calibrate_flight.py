@@ -528,9 +528,7 @@ def _assemble(
         constant=float(np.median(constants)),
         relative_error=error,
         strip=", ".join(strip.path.name for strip in strips),
-        conditions=good[0].conditions + ONE_VIEW
-        if len(strips) == 1
-        else f"{len(strips)} strips, {good[0].conditions}",
+        conditions=good[0].conditions + ONE_VIEW if len(strips) == 1 else f"{len(strips)} strips, {good[0].conditions}",
         targets=tuple(
             # Those without any echo on a strip of several are left out.
             row if len(strips) == 1 else replace(row, name=f"{row.name} on {strip.path.name}")

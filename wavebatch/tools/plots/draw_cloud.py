@@ -240,9 +240,6 @@ MARKERS = "os^Dv*"
 MOST_TOGETHER = 6
 """Most series in one axes: more lines cannot be followed."""
 
-FEWEST_IN_LINE = FEWEST
-"""Series of fewer values than bins are points: each value would be a needle of a line."""
-
 _NARROW = 4.0
 """Maps so many times as high as wide have a separate place for the scale of colours: it would shrink with them."""
 
@@ -297,7 +294,7 @@ def _draw_histogram(axes: Axes, found: Histogram, *, log: bool, counts: bool) ->
         low, median, high = (_value_text(value, found.edges) for value in (low_end, middle, high_end))
         label = "" if alone else fit_text(figure, f"{plain_text(found.names[series], 200)}: ", 3.6, size=8.0)
         text = f"{label}{number:,} values, mean {_value_text(found.means[series], found.edges)}, median {median}{unit}"
-        if number < FEWEST_IN_LINE:
+        if number < FEWEST:  # than bins: each value would be a needle of a line
             filled, middles = np.flatnonzero(shown), 0.5 * (found.edges[:-1] + found.edges[1:])
             # A share of two values is a half: it would press all other series down.
             place = {} if counts else {"transform": axes.get_xaxis_transform()}
