@@ -339,17 +339,24 @@ def test_a_pulse_looks_too_good_to_the_waveforms_that_taught_it(errors, small, d
 
 
 @pytest.mark.parametrize(
-    ("repeated", "answered", "errors", "taken", "spread"),
-    [(1.0, 400, 0, "half", 0.5**0.5), (1.0, 400, 1, "half", 0.614), (1.05, 400, 2.9, "half", 0.12),
-     (2.0, 400, 0, "right", 0), (0.92, 400, 2, "right", 0), (2.0, 100, 0, "half", 0.5**0.5), (2.0, 400, 4, "half", 0)],
+    ("repeated", "known", "echoes", "answered", "errors", "taken", "spread"),
+    [(1.0, False, 390, 400, 0, "half", 0.5**0.5), (1.0, False, 390, 400, 1, "half", 0.614),
+     (1.05, False, 390, 400, 2.9, "half", 0.12), (2.0, False, 390, 400, 0, "right", 0),
+     (0.92, False, 390, 400, 2, "right", 0), (2.0, False, 390, 100, 0, "half", 0.5**0.5),
+     (2.0, False, 390, 400, 4, "half", 0), (2.0, True, 390, 400, 0, "half", 0.5**0.5),
+     (2.0, True, 410, 400, 0, "right", 0), (1.0, True, 410, 400, 0, "right", 0.5**1.5)],
 )  # fmt: skip
-def test_a_pulse_whose_echoes_repeat_another_width_must_be_shorter_for_sure(repeated, answered, errors, taken, spread):
-    """Than one whose echoes agree with it, and that sees them. Widths of others count as likely as they are."""
+def test_a_pulse_whose_echoes_repeat_another_width_must_be_shorter_for_sure(
+    repeated, known, echoes, answered, errors, taken, spread
+):
+    """Than one whose echoes agree with it, and that sees them. Widths of others count as likely as they are. In a
+    canopy echoes of a known pulse may all be wider: it is taken, but makes no other one a guess."""
     more = 0.5 * np.resize([1.0, -1.0], 400)
     half, right = (
-        choose_pulse.Candidate(name, SystemPulse(width), 0.0, 50 + more, echoes, seen, False, 1, 0.0, own)
-        for name, width, more, echoes, seen, own in (
-            ("half", 1.0, 0 * more, 390, 400, repeated), ("right", 2.0, errors * 0.025 + more, 400, answered, 1.0)
+        choose_pulse.Candidate(name, SystemPulse(width), 0.0, 50 + more, number, seen, of_other, 1, 0.0, own)
+        for name, width, more, number, seen, of_other, own in (
+            ("half", 1.0, 0 * more, echoes, 400, known, repeated),
+            ("right", 2.0, errors * 0.025 + more, 400, answered, False, 1.0),
         )
     )  # fmt: skip
     choice = choose_pulse._decide([half, right])

@@ -408,10 +408,12 @@ def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
     Of pulses as simple the one with the fewest echoes, or the shortest description of those within AS_FEW of it.
     """
     # Echoes that repeat another width than that of their pulse contradict it, unless it is shorter for sure than all
-    # that agree with theirs. Hardly an echo is seen by one that is far too wide: it says nothing.
+    # that agree with theirs. Hardly an echo is seen by one that is far too wide: it says nothing. And a known pulse may
+    # be that of a canopy without any level target.
     agreed = [one for one in found if LEAST_REPEATED < one.repeated < 1 + OTHER_WIDTH]
-    every, found = found, [one for one in found if one in agreed or not any(
+    contradicted = [one for one in found if one not in agreed and any(
         each.exceeds(one) < SURE and each.answered >= BLIND * one.answered for each in agreed)]  # fmt: skip
+    every, found = found, [one for one in found if one.known or one not in contradicted]
     ordered = []
     for number in sorted({one.gaussians for one in found}):
         alike = [one for one in found if one.gaussians == number]
@@ -429,6 +431,7 @@ def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
             best = one
     # One of its width must beat a known pulse itself: a wide one did, and this one beat that.
     best = next((one for one in replaced if one.known and _is_as_wide(one, best) and not _beats(best, one)), best)
+    ordered = [one for one in ordered if one is best or one not in contradicted]
     tied = [one for one in ordered if one.exceeds(best) < SURE]
     # Fewer echoes lost by less than many waveforms would ask for, or than waveforms that were learned from can show.
     most = SURE + HINT if SHOWN * np.sqrt(best.answered) < SURE + HINT else SURE
