@@ -76,7 +76,7 @@ def test_light_that_noise_hides_is_in_the_errors(tmp_path, ratio):
     """Ground below leaves is 2 to 3 noises high: 4 % more cover and a sixth more leaves, with errors of 1 and 5 %."""
     rng = np.random.default_rng(3)
     leaves = grow(rng, SIDE, crowns=None, density=0.3)
-    fly(tmp_path / "s.las", rng, leaves, SIDE, pulses=3.0, light=30.0)
+    fly(tmp_path / "s.las", rng, leaves, SIDE, pulses=5.0, light=30.0)
     _, found = measure(voxelize(tmp_path / "s.las", tmp_path / "v.laz", ratio=ratio), tmp_path)
     true = np.array([[leaves.area_index(x, y, CELL) for x in (0, 10)] for y in (10, 0)])
     for name, right in (("leaf_area_index", true), ("cover", 1 - np.exp(-0.5 * true))):
