@@ -301,7 +301,7 @@ def test_thinned_points_over_ground_in_common_are_no_other_rate_of_pulses(tmp_pa
     for rows in found.places.values():
         rows[2] += 0.04  # too little for a proof
     growth = compare_setting(known, found._replace(rate=known.rate), SystemPulse(2.0))[0]
-    assert growth == pytest.approx(0.041, abs=0.005)
+    assert 0.04 < growth < 0.06
 
 
 @pytest.mark.slow
