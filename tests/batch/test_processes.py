@@ -11,7 +11,6 @@ import time
 from concurrent.futures import Future
 
 import pytest
-from commands import refuses
 
 from wavebatch.batch.workers.futures import WorkerDied
 from wavebatch.batch.workers.processes import Workers
@@ -84,7 +83,8 @@ def test_results_and_errors_come_back():
         while left:
             left = [future for future in left if future not in workers.wait(left)]
         assert [future.result() for future in futures[:-1]] == [number**2 for number in range(20)]
-        refuses(ValueError, "bad 7", futures[-1].result)
+        with pytest.raises(ValueError, match="bad 7"):
+            futures[-1].result()
 
 
 @pytest.mark.quick_cases("True")
@@ -301,6 +301,7 @@ def test_map_gives_results_in_order_and_makes_calls_itself_that_kill_a_process()
     with Workers(2) as workers:
         call = functools.partial(die_elsewhere, os.getpid())
         assert list(workers.map(call, range(12))) == [number**2 for number in range(12)]
-        refuses(ValueError, "bad 0", list, workers.map(raise_error, range(3)))
+        with pytest.raises(ValueError, match="bad 0"):
+            list(workers.map(raise_error, range(3)))
     with Workers(1) as workers:
         assert list(workers.map(square, range(3))) == [0, 1, 4]
