@@ -256,6 +256,25 @@ def test_vectors_that_roll_along_the_strip_are_named_and_in_the_errors(degrees, 
     assert (0.4 * abs(degrees) if named else 0.0) < found.turned < max(abs(degrees), 0.03)
 
 
+@pytest.mark.parametrize("step", [0.0, 20.0])
+@pytest.mark.parametrize("lines", [1, 2, 3])
+def test_sound_lines_over_level_ground_are_not_called_turned(lines, step):
+    """Rounded coordinates turned windows by radians about the axis that level ground does not show."""
+    rng = np.random.default_rng(7)
+    second = np.sort(rng.uniform(0.0, 3.0, 8000))
+    across = np.tan(np.radians(15.0)) * (1.0 - 2.0 * (50.0 * second % 1.0))
+    ahead = np.stack([np.full(8000, 0.05), across, np.full(8000, -1.0)], axis=1)
+    ground = ahead * (700.0 - step * (second > 1.5))[:, None] + np.stack([60.0 * second, 0 * second, 0 * second], 1)
+    unit = ahead / np.linalg.norm(ahead, axis=1)[:, None]
+    parts = []
+    for line in range(lines):
+        back = about(2, 180.0 * line if lines == 2 else 90.0 * line)
+        parts.append((START_TIME + 300 * line + second, np.round(ground @ back.T, 2), unit @ back.T, np.ones(8000)))
+    rays = RaySample(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    found = estimate_path(rays, "direction vectors", RaySample(*(values[:0] for values in rays)))
+    assert not found.doubt() and dict(found.facts)["turned_error_deg"] < 0.105
+
+
 @pytest.mark.parametrize(("degrees", "error"), [(0.3, 0.0242), (1.0, 0.0309)])
 def test_how_large_turns_are_is_found_with_them_and_scanners_set_a_floor(degrees, error):
     """A first round alone gave 0.971 of 1 degree; mirrors have one floor in all windows, relief one in each."""

@@ -548,11 +548,11 @@ def find_turn(
             total, floor = each[:, kind].sum(axis=0), count * floors[:, kind].mean(axis=0)
             seen = np.linalg.pinv(total, hermitian=True) @ sides[:, kind].sum(axis=0)
             off = sides[:, kind] - each[:, kind] @ seen
-            apart = np.einsum("wi,wij,wj->", off, np.linalg.pinv(each[:, kind], hermitian=True), off)
-            apart /= max(3 * len(parts) - 3, 1)
+            # Over level ground rounding alone turns windows by radians about an axis that they hardly show.
+            loose = np.linalg.inv(each[:, kind] + np.eye(3) / MOUNTING**2)
+            apart = np.einsum("wi,wij,wj->", off, loose, off) / max(3 * len(parts) - 3, 1)
             if not kind and apart > SURE_TURN:  # vectors that roll by themselves, each window in its own way
-                alone = np.linalg.solve(each[:, 0] + np.eye(3) / MOUNTING**2, sides[:, 0, :, None])[:, :, 0]
-                varied = OF_JUMP**2 * np.cov(alone.T)
+                varied = OF_JUMP**2 * np.cov(np.einsum("wij,wj->iw", loose, sides[:, 0]))
             total = total / max(1.0, apart)
             both = total @ np.linalg.pinv(total + floor, hermitian=True) @ floor
             known, right = known + both, right + both @ seen
