@@ -40,11 +40,10 @@ MEMORIES, SURE, HELD = (16, 64, 256, 1024), 3.0, 2.0
 """Pulses before and after one, whose light shows a receiver that follows it; errors from which it does (real strips and
 sound scenes stay below 2); and by how much its gain varies more than these show: 1 to 3 times in simulated strips."""
 
-SAME_TOP, TIED, SURFACES = 0.84, 2, 0.6
-"""Share of the packets whose brightest sample is the same number where each packet was scaled, which noise does not
-leave; samples that may share it, as rounding does on both sides of a peak, while clipped tops have more; and by how
-much surfaces of one strip differ in brightness: real and simulated ones by 0.1 to 0.9 (robust standard deviation of the
-logarithm)."""
+SAME_TOP, SURFACES = 0.84, 0.6
+"""Share of the packets whose one brightest sample is the same number where each packet was scaled, which noise does not
+leave: one, since two are the same also where even ground is weak or clipped; and by how much surfaces of one strip
+differ in brightness: real and simulated ones by 0.1 to 0.9 (robust standard deviation of the logarithm)."""
 
 PERIODS = (2, 3, 4)
 """Lasers, or heads, that may take turns."""
@@ -257,8 +256,8 @@ def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[floa
 
 
 def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy | None) -> np.ndarray:
-    """Time, light, energy (1 where nothing is known), channel, brightest sample (0 where more than TIED are), its east
-    and north of waveforms in the order of time, f8 (7, n)."""
+    """Time, light, energy (1 where nothing is known), channel, brightest sample (0 where several are), its east and
+    north of waveforms in the order of time, f8 (7, n)."""
     parts = [np.empty((7, 0))]
     for block, _ in reader.read_rows(unit, rows, BLOCK):
         given = None if energy is None else energy.fill(block, unit).pulse_energy
@@ -266,7 +265,7 @@ def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy
         channel = np.full(len(block), SCANNERS * block.digitizer.index)
         channel += 0 if block.scanner is None else block.scanner
         above, top = np.nan_to_num(take_off_level(block)), block.samples.max(axis=1)
-        alone = (block.samples == top[:, None]).sum(axis=1) <= TIED
+        alone = (block.samples == top[:, None]).sum(axis=1) == 1
         place = (block.origin + block.direction * (block.spacing * np.argmax(above, axis=1))[:, None]).T[:2]
         parts.append(np.stack([block.gps_time, above.sum(axis=1), sent, channel, top * alone, *place]))
     joined = np.concatenate(parts, axis=1)
