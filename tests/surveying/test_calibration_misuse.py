@@ -209,6 +209,27 @@ def test_what_a_term_is_known_to_at_the_edge_is_in_the_errors(tmp_path, calibrat
     found, _ = calibrate(tmp_path, "--scan-angle", strips=["a.las"])
     for row in (*found.channels, *found.strips):
         assert row.relative_error == pytest.approx(np.hypot(known, 0.4), rel=0.01)
+    assert "assumed" not in found.conditions
+
+
+@pytest.mark.parametrize(
+    ("gains", "again", "assumed"),
+    [
+        ({1: 1.0, 2: 0.5}, None, True),
+        ({1: 1.0}, {}, True),
+        ({1: 1.0}, {"start": (98, 100), "heading": 270.0}, False),
+    ],
+    ids=["two channels", "the same line", "other heading"],
+)
+def test_even_light_is_assumed_where_no_place_is_seen_at_other_angles(tmp_path, gains, again, assumed):
+    """It was said of one file, whatever was in it."""
+    write_field(tmp_path / "t.csv")
+    strips = [write_strip(tmp_path / "a.las", FARMLAND, replace(SENSOR, gains=gains), 8000, seed=1)]
+    if again is not None:
+        later = replace(SENSOR, time=START + 600, **again)
+        strips.append(write_strip(tmp_path / "b.las", FARMLAND, later, 8000, seed=2))
+    found, _ = calibrate(tmp_path, strips=[strip.name for strip in strips])
+    assert found.conditions.endswith("even light across the swath assumed") == assumed
 
 
 SENSOR = Sensor(**BASE, light=LIGHT)

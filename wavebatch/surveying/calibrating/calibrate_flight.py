@@ -39,8 +39,10 @@ MOST_TIES = 200_000
 MOST_OF_COLUMN = 20_000
 """Most waveforms of a strip that are decomposed for a column of reflectances, from whole squares as well."""
 
-ONE_VIEW = ", even light across the swath assumed"
-"""Of one strip: it sees each place at one angle, and fields hide what falls from side to side."""
+ONE_VIEW, OTHER_ANGLES = ", even light across the swath assumed", 0.1
+"""Where each place is seen at one angle, as by one strip: fields hide what falls from side to side. And standard
+deviation of the angles at which one place is seen, over that of all, from which it shows: of light that falls by a
+fifth, 2 % are a trend then (LEAST_SPREAD)."""
 
 _Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper corner in x and y [m]."""
@@ -416,6 +418,10 @@ def calibrate_flight(
     else:
         adjusted = adjust.adjust_constants(ties, anchors)
     calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath).widened(edge)
+    angle, of = ties.view["angle"], ties.cell
+    within = angle - (np.bincount(of, angle) / np.bincount(of))[of]
+    if not swath and not (len(angle) and np.std(within) > OTHER_ANGLES * np.std(angle)):
+        calibration = replace(calibration, conditions=calibration.conditions + ONE_VIEW)
     names = [source.name for source in sources]
     pairs = tuple(adjust.compare_pairs(ties, adjusted, names))
     lost = []
@@ -528,7 +534,7 @@ def _assemble(
         constant=float(np.median(constants)),
         relative_error=error,
         strip=", ".join(strip.path.name for strip in strips),
-        conditions=good[0].conditions + ONE_VIEW if len(strips) == 1 else f"{len(strips)} strips, {good[0].conditions}",
+        conditions=good[0].conditions if len(strips) == 1 else f"{len(strips)} strips, {good[0].conditions}",
         targets=tuple(
             # Those without any echo on a strip of several are left out.
             row if len(strips) == 1 else replace(row, name=f"{row.name} on {strip.path.name}")
