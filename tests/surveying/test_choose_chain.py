@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import kept_surveys
@@ -13,6 +14,7 @@ from helpers_scenes import make_scene
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import parse_chain
 from wavebatch.surveying.choose_chain import COSTS, Request, make_choice, widest_chain
+from wavebatch.surveying.predict_error import predict_errors
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 
 pytestmark = pytest.mark.kept_surveys
@@ -215,3 +217,24 @@ def test_a_choice_travels_between_processes(strips):
         again = pickle.loads(pickle.dumps(choice))
         assert again.survey == choice.survey and again.decisions == choice.decisions
         assert again.predictions == choice.predictions
+
+
+def test_the_digitizer_with_most_waveforms_predicts_the_errors(strips, monkeypatch):
+    """Whichever has the lower number: the other is hardly known."""
+    used = []
+
+    def note(block, *others):
+        used.append(block.digitizer.index)
+        return predict_errors(block, *others)
+
+    monkeypatch.setattr("wavebatch.surveying.predict_error.predict_errors", note)
+    request = Request(tolerance=0.1)
+    with StripReader(strips / "flat.las") as reader, reader.scan() as scan:
+        blocks = list(reader.sample_blocks(scan, 1000))
+        for few in (1, 9):
+            some = blocks[0].rows(slice(60))
+            some = replace(some, digitizer=replace(some.digitizer, index=few))
+            many = [replace(block, digitizer=replace(block.digitizer, index=5)) for block in blocks]
+            monkeypatch.setattr(StripReader, "sample_blocks", lambda *_, sample=(some, *many): iter(sample))
+            make_choice(reader, scan, widest_chain(request), request)
+    assert used == [5, 5]
