@@ -488,13 +488,14 @@ def test_coloured_noise_is_no_slope(riegl):
     assert system.defects.slope_spread == 0
 
 
-@pytest.mark.parametrize("kind", ["interference", "spikes", "undershoot", "varying", "some", "kept"])
+@pytest.mark.parametrize("kind", ["interference", "spikes", "late", "undershoot", "varying", "some", "kept"])
 def test_what_goes_down_as_far_as_up_is_no_echo(kind):
     """Interference in a tenth of the waveforms, and bipolar spikes in a third, made 10 to 48 % of the echoes false,
     without a word: the mirror did not see the holes, beside the false echoes. Undershoots are no such holes, nor
-    where they vary or follow some echoes only: nothing is before these."""
+    where they vary or follow some echoes only. Spikes that only come late are spikes."""
     rng = np.random.default_rng(21)
-    n, s, x = 1200, 128, np.arange(128.0)
+    n, s = 1200, 200 if kind == "late" else 128
+    x = np.arange(float(s))
     pulse = (lambda z: bell(z) - 0.06 * bell((z - 5) / 2)) if kind == "undershoot" else bell
     signal, rows, time, _ = render(pulse, 21, n=n, s=s, amplitude=(10, 300), second=0.3)
     if kind in ("varying", "some"):
@@ -503,14 +504,14 @@ def test_what_goes_down_as_far_as_up_is_no_echo(kind):
         signal = 4 * (signal - share[:, None] * below)
     if kind == "interference":
         signal += (rng.random((n, 1)) < 0.1) * 3 * np.sin(2 * np.pi * x / 17 + rng.uniform(0, 2 * np.pi, (n, 1)))
-    elif kind == "spikes":
-        z = (x - rng.uniform(5, s - 5, (n, 1))) / 1.3
+    elif kind in ("spikes", "late"):
+        z = (x - rng.uniform(5 if kind == "spikes" else 150, s - 5, (n, 1))) / 1.3
         signal += (rng.random((n, 1)) < 0.3) * 12 * z * bell(z)
     block = digitize(signal, 21, noise=1.0, base=60, top=4095)
     survey = survey_block(block)
     _, true, _ = compare(load_profile("accurate").run(block, survey.system), rows, time)
     doubts = [one.text for one in doubt_survey(survey.system, survey.figures, n)]
-    if kind in ("interference", "spikes"):
+    if kind in ("interference", "spikes", "late"):
         assert true < 0.93 and ["of 100 echoes" in text for text in doubts] == [True]
     else:
         assert true > 0.99 and not doubts

@@ -291,8 +291,7 @@ def _survey(
         if not (system.components or system.kappa):  # a plain Gaussian: what it leaves after each echo
             tail = (share for lag, share in system.tail_misfit if 0 < lag <= RINGING_REACH * system.sigma_ref)
             system = replace(system, ringing=max((share for share in tail if share >= LEAST_RINGING), default=0.0))
-        whitened = choose_whitening(part, replace(borne, noise=system.noise), choice.best.change, looked)
-        system = replace(system, noise=whitened.noise)
+        system = choose_whitening(part, system, choice.best.change, looked)
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
         system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)

@@ -335,7 +335,7 @@ static void measure_misfits(const Work *work, double reach, double *misfit) {
     const int64_t k = work->fit.k, n = work->fit.per * k;
     const Window *w = &work->window;
     const lanes *residual = work->rows + n * w->vectors;
-    if (k == 1) misfit[0] = sqrt(work->fit.gram[n * (n + 1) + n] / (w->used > 0 ? w->used : 1)) / w->std;
+    if (k == 1) misfit[0] = sqrt(at_least(work->fit.gram[n * (n + 1) + n], 0) / (w->used > 0 ? w->used : 1)) / w->std;
     for (int64_t j = 0; j < k && k > 1; j++) {
         const float time = work->fit.parameters[k + j];
         lanes squares = ALL(0), used = ALL(0);

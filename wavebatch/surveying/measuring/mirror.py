@@ -16,6 +16,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.detect.direct import matched_filter, maximum
+from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.judge import SEARCH, SURE, Explained
 from wavebatch.surveying.measuring.misfit import MOST_FAINT
@@ -130,10 +131,13 @@ def count_holes(system: SystemPulse, explained: Explained, spacing: float) -> in
     highest = sums.model[row[:, None], near].max(axis=1, initial=0.0)
     noise = HOLDS * np.sqrt((system.noise.std**2 + system.noise.gain * highest) / energy)
     deep = middle[row, place] > np.maximum(noise, LACK * highest)
-    # Undershoots follow the strong echo that makes them. Noise makes as many holes before it: more are not counted.
-    strong = np.where(top[:, 0] > 0, (sums.model >= 0.5 * top).argmax(axis=1), middle.shape[1])
-    number = np.count_nonzero(deep & (place < strong[row]))
-    most = (number + SURE * np.sqrt(number + 1)) * middle.size / max(strong.sum(), 1)
+    # Undershoots follow the strong echo that makes them, as near as ringing and as the filter reaches. Noise makes as
+    # many holes elsewhere: more are not counted.
+    at = np.arange(middle.shape[1])
+    strong = np.maximum.accumulate(np.where((sums.model >= 0.5 * top) & (top > 0), at, -np.inf), axis=1)
+    elsewhere = at - strong > RINGING_REACH * width + len(taps) - 1
+    number = np.count_nonzero(deep & elsewhere[row, place])
+    most = (number + SURE * np.sqrt(number + 1)) * middle.size / max(np.count_nonzero(elsewhere), 1)
     return int(min(np.count_nonzero(deep), most))
 
 

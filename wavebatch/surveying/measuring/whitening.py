@@ -125,7 +125,7 @@ def choose_whitening(
     block : WaveformBlock
         A sample of the strip.
     system : SystemPulse
-        Its pulse and noise, with the misfit that the change asks for: a filter for noise makes changes into echoes.
+        Its pulse and noise.
     change : float
         Of the pulse from shot to shot, as a share of its amplitude.
     seen : (SystemPulse, Explained), optional
