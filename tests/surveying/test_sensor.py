@@ -256,6 +256,20 @@ def test_vectors_that_roll_along_the_strip_are_named_and_in_the_errors(degrees, 
     assert (0.4 * abs(degrees) if named else 0.0) < found.turned < max(abs(degrees), 0.03)
 
 
+@pytest.mark.parametrize("degrees", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_vectors_that_swing_fast_are_in_the_errors_where_pairs_show_them(axis, degrees):
+    """In windows of 1.5 s a swing of 3 s is a drift of the sensor: .3 degrees had an error of .007."""
+    swung, vectors, pairs = np.radians(degrees), *flight_of_turned_vectors(np.eye(3))
+    vectors, pairs = (
+        one._replace(**{name: rays + np.cross(np.eye(3)[axis] * (swung * np.sin(2 * one.time))[:, None], rays)})
+        for one, name, rays in ((vectors, "direction", vectors.direction), (pairs, "vector", pairs.vector))
+    )
+    found = dict(estimate_path(vectors, "direction vectors", pairs).facts)
+    rms = np.degrees(np.std(swung * np.sin(2 * pairs.time)))
+    assert 1.0 * rms < found["turned_error_deg"] < 1.6 * rms + 0.003
+
+
 @pytest.mark.parametrize("step", [0.0, 20.0])
 @pytest.mark.parametrize("lines", [1, 2, 3])
 def test_sound_lines_over_level_ground_are_not_called_turned(lines, step):
