@@ -291,7 +291,12 @@ def _survey(
         if not (system.components or system.kappa):  # a plain Gaussian: what it leaves after each echo
             tail = (share for lag, share in system.tail_misfit if 0 < lag <= RINGING_REACH * system.sigma_ref)
             system = replace(system, ringing=max((share for share in tail if share >= LEAST_RINGING), default=0.0))
-        system = choose_whitening(part, system, choice.best.change, looked)
+        # With the misfit that the change asks for whitened fits make no echoes of it, without it they keep close pairs:
+        # either will do, as the misfit is chosen after it.
+        borne = replace(borne, noise=system.noise)
+        tried = (system, borne)[: 1 + (borne.misfit > system.misfit)]
+        noises = (choose_whitening(part, one, choice.best.change, looked).noise for one in tried)
+        system = replace(system, noise=next((noise for noise in noises if noise.whitening), system.noise))
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
         system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
