@@ -187,9 +187,9 @@ def read_sample(reader: StripReader, scan: StripScan, waveforms: int | None = No
     Returns
     -------
     list of WaveformBlock
-        One block per digitizer, the one with the most samples first; empty for a strip without waveforms.
+        Copies of a waveform too; empty for a strip without waveforms.
     """
-    return join_digitizers(reader.sample_blocks(scan, waveforms or reader.sample_size(scan)))
+    return list(reader.sample_blocks(scan, waveforms or reader.sample_size(scan)))
 
 
 def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Request) -> ChainChoice:
@@ -212,8 +212,7 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
     ConfigError
         Where no shipped chain meets the tolerance.
     """
-    needs_sample = request.system is None or request.tolerance is not None
-    sample = list(reader.sample_blocks(scan, reader.sample_size(scan))) if needs_sample else []
+    sample = read_sample(reader, scan) if request.system is None or request.tolerance is not None else []
     if request.system is None:
         from wavebatch.surveying.outgoing import compare_outgoing  # these and what they import: 10 ms
         from wavebatch.surveying.survey import survey_blocks
@@ -272,7 +271,7 @@ def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request
         return choice
     from wavebatch.surveying.predict_error import WAVEFORMS, leave_out_false, predict_errors
 
-    sample = read_sample(reader, scan, WAVEFORMS)
+    sample = join_digitizers(read_sample(reader, scan, WAVEFORMS))
     if not sample:
         return choice
     chains = {_USERS: choice.chain, COSTS[-1]: load_profile(COSTS[-1])}

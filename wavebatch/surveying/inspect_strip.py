@@ -386,7 +386,8 @@ def survey(
         raise ConfigError(f"waveforms: must be a whole number from 1 on, got {waveforms!r}")
     if not (divergence is None or isinstance(divergence, int | float | np.number) and 0.001 <= divergence <= 100):
         raise ConfigError(f"divergence: must lie from 0.001 to 100 mrad, got {divergence!r}")
-    from wavebatch.surveying.flat_ground import survey_angles  # `info` needs none of these
+    from wavebatch.surveying.choose_chain import read_sample  # `info` needs none of these
+    from wavebatch.surveying.flat_ground import survey_angles
     from wavebatch.surveying.look import join_digitizers, with_look
     from wavebatch.surveying.outgoing import compare_outgoing
     from wavebatch.surveying.survey import survey_blocks
@@ -411,7 +412,7 @@ def survey(
         if not any(map(len, sample)):
             raise InputError("these blocks hold no waveform to be surveyed")
         return _with_decisions(with_look(survey_blocks(sample), sample))
-    sample = list(strip.reader.sample_blocks(strip.scan, waveforms or strip.reader.sample_size(strip.scan)))
+    sample = read_sample(strip.reader, strip.scan, waveforms)
     if not sample:
         path = strip.facts.path
         raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")

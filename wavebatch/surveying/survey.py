@@ -144,8 +144,9 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True, errors
     for length, at in sorted(seams.items()):
         reason = f"packets of {length} samples are interpolated at sample {at}: two recordings meet there"
         decisions.append(Decision("seam left out", True, reason))
-    if copies := sum(map(len, blocks)) - sum(map(len, joined)):
-        reason = f"{copies} of {sum(map(len, blocks))} waveforms are copies of others, and show nothing more"
+    given = sum(map(len, blocks))
+    if copies := given - sum(map(len, joined)):
+        reason = f"{copies} of {given} waveforms are copies of others, and show nothing more"
         decisions.append(Decision("copies count once", True, reason))
     system = replace(found.system, seams=seams, digitizers=systems)
     return replace(found, system=system, decisions=tuple(decisions))

@@ -280,13 +280,6 @@ static void weigh_laws(double ratio, double error, int64_t vectors, const lanes 
     density[0][0] = exp_lanes(ALL(-0.5f * fminf(z * z, 160)))[0] * (float)ROOT_2PI_INVERSE * inverse;
 }
 
-/* Density of a width by the sum of laws of these shares. */
-INLINE float add_laws(const lanes *density, const lanes *share, int64_t vectors) {
-    lanes sum = density[0] * share[0];
-    for (int64_t v = 1; v < vectors; v++) sum += density[v] * share[v];
-    return sum_lanes(sum);
-}
-
 /* Cost of each of n widths [nats] by the sum of laws that makes the known ones likeliest, with the scatter beyond their
    errors that serves best; a share `anywhere` of them lies anywhere up to the widest. */
 EXPORT int64_t describe_widths(int64_t n, const double *ratio, const double *error, const uint8_t *known, int64_t scatters,
@@ -312,13 +305,13 @@ EXPORT int64_t describe_widths(int64_t n, const double *ratio, const double *err
             for (int64_t i = 0; i < n; i++) {
                 if (!known[i]) continue;
                 const lanes *own = density + i * vectors;
-                const float whole = 1 / fmaxf(add_laws(own, share, vectors), 1e-30f);
+                const float whole = 1 / fmaxf(multiply(vectors, own, share), 1e-30f);
                 for (int64_t v = 0; v < vectors; v++) next[v] += own[v] * whole;
             }
             for (int64_t v = 0; v < vectors; v++) share[v] = (next[v] * share[v] + 0.5f) * (float)(1 / (number + 0.5 * laws));
         }
         for (int64_t i = 0; i < n; i++) {
-            const double whole = add_laws(density + i * vectors, share, vectors);
+            const double whole = multiply(vectors, density + i * vectors, share);
             tried[i] = -log_double((1 - anywhere) * whole + anywhere / wider[uniform - 1]);
             if (known[i]) sum += tried[i];
         }

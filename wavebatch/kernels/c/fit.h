@@ -85,24 +85,23 @@ static void multiply_long_rows(int64_t rows, int64_t vectors, const lanes *row, 
 INLINE void multiply_rows(int64_t rows, int64_t vectors, const lanes *row, double *gram) {
     if (vectors > LONG) { multiply_long_rows(rows, vectors, row, gram); return; }
     for (int64_t i = 0; i < rows; i++)
-        for (int64_t j = 0; j <= i; j++) {
-            const lanes *a = row + i * vectors, *b = row + j * vectors;
-            lanes sum = a[0] * b[0];
-            for (int64_t v = 1; v < vectors; v++) sum += a[v] * b[v];
-            gram[i * rows + j] = sum_lanes(sum);
-        }
+        for (int64_t j = 0; j <= i; j++) gram[i * rows + j] = multiply(vectors, row + i * vectors, row + j * vectors);
 }
 
-/* Inner products of the rows as `take_level_off` would leave them: (I - l l')^2 = I - (2 - l'l) l l'. */
+/* Takes off the products of row i with those up to it what `take_level_off` would take off both: (I - l l')^2 = I - (2 - l'l) l l'.
+   along: the product of row i and the level. */
+INLINE void take_level_off_products(Work *work, int64_t i, double along, double *restrict products) {
+    const double share = (2 - work->window.level_share) * along, *restrict before = work->along;
+    work->along[i] = along;
+    for (int64_t j = 0; j <= i; j++) products[j] -= share * before[j];
+}
+
+/* Inner products of the rows without their levels. */
 INLINE void find_products(int64_t rows, Work *work, double *gram) {
     const Window *w = &work->window;
     multiply_rows(rows, w->vectors, work->rows, gram);
-    for (int64_t i = 0; i < rows && w->level_share > 0; i++) {
-        const double *restrict along = work->along, share = (2 - w->level_share) * multiply(w->vectors, work->rows + i * w->vectors, w->level);
-        double *restrict row = gram + i * rows;
-        work->along[i] = share / (2 - w->level_share);
-        for (int64_t j = 0; j <= i; j++) row[j] -= share * along[j];
-    }
+    for (int64_t i = 0; i < rows && w->level_share > 0; i++)
+        take_level_off_products(work, i, multiply(w->vectors, work->rows + i * w->vectors, w->level), gram + i * rows);
 }
 
 /* Adds to the products what is known of widths (H1) and skews (1.2) before the fit; the cost of that. */
@@ -306,10 +305,10 @@ INLINE void find_errors(int64_t k, int64_t per, Work *work, Solution *out) {
     const double *p = work->fit.parameters, std = work->window.std;
     if (!invert(k, per, work, work->fit.gram, out->errors, out->shared)) {
         for (int64_t i = 0; i < n; i++) {
-            work->along[i] = work->window.level_share > 0 ? multiply_wide(vectors, work->rows + i * vectors, work->window.level) : 0;
-            for (int64_t j = 0; j <= i; j++)
-                work->products[i * rows + j] = multiply_wide(vectors, work->rows + i * vectors, work->rows + j * vectors)
-                    - (2 - work->window.level_share) * work->along[i] * work->along[j];
+            const lanes *row = work->rows + i * vectors;
+            for (int64_t j = 0; j <= i; j++) work->products[i * rows + j] = multiply_wide(vectors, row, work->rows + j * vectors);
+            if (work->window.level_share > 0)
+                take_level_off_products(work, i, multiply_wide(vectors, row, work->window.level), work->products + i * rows);
         }
         add_prior(k, per, &work->fit.prior, std, p, work->products);
         invert(k, per, work, work->products, out->errors, out->shared);

@@ -48,11 +48,7 @@ static void hermite_moments(Work *work, const Fit *fit) {
 static void take_rows_off(Work *work, int64_t p, lanes *direction) {
     const int64_t n = work->window.vectors;
     double *share = work->column;
-    for (int64_t i = 0; i < p; i++) {
-        lanes sum = ALL(0);
-        for (int64_t v = 0; v < n; v++) sum += work->rows[i * n + v] * direction[v];
-        share[i] = sum_lanes(sum);
-    }
+    for (int64_t i = 0; i < p; i++) share[i] = multiply(n, work->rows + i * n, direction);
     solve(p, work->matrix, share);
     for (int64_t i = 0; i < p; i++) {
         const float part = share[i];

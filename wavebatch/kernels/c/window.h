@@ -85,15 +85,13 @@ INLINE void take_level_off(const Window *w, double times, lanes *row) {
 /* An error of the level is noise of the covariance u u' error^2, where u is the whitened row of ones. The root of the
    inverse of that and white noise is I - l l', with l along u. Clipped samples are known from nothing. */
 static void free_level(double error, Window *w) {
-    lanes sum = ALL(0);
     for (int64_t v = 0; v < w->vectors; v++) {
         w->level[v] = pick(w->x[v] >= 0.f, ALL(1), ALL(0));
         if (w->any_clipped) w->level[v] = pick(w->clipped[v] != 0.f, ALL(0), w->level[v]);
         if (w->is_weighted) w->level[v] *= w->weight[v];
     }
     if (w->is_whitened) whiten(w, w->level);
-    for (int64_t v = 0; v < w->vectors; v++) sum += w->level[v] * w->level[v];
-    const double square = sum_lanes(sum);
+    const double square = multiply(w->vectors, w->level, w->level);
     if (!(square > 0)) return;
     w->level_share = 1 - 1 / sqrt(1 + error * error * square / (w->std * w->std));
     const float scale = sqrt(w->level_share / square);

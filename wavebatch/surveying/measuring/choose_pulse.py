@@ -591,23 +591,19 @@ def _choose_misfit(
             best, longer = look(first - 1)
     while longer[0] <= 1 and min(lengths) > 0:  # what was looked at last may be the shortest
         best, longer = look(min(lengths) - 1)
-    places = sorted(lengths)
+    places, misfit = sorted(lengths), 0.0
     while longer[0] > 1:
         first = next(place for place, errors in enumerate(longer) if errors <= 1)
-        if places[first] - places[first - 1] <= FINEST:
+        (before, after), (over, under) = places[first - 1 : first + 1], longer[first - 1 : first + 1]
+        if after - before <= FINEST:
+            misfit = float(MISFITS[0] * 2.0 ** (before + (over - 1) / (over - under) * (after - before)))
             break
-        best, longer = look((places[first - 1] + places[first]) / 2)
+        best, longer = look((before + after) / 2)
         places = sorted(lengths)
     between = np.linspace(places[0], places[-1], 8 * len(MISFITS))
     numbers = np.interp(between, places, [len(found[place].explained.echoes) for place in places])
     as_likely = numbers[np.interp(between, places, longer) <= 1]
     doubt = float(np.ptp(as_likely)) / max(len(found[best].explained.echoes), 1) if len(as_likely) else 0.0
-    misfit = 0.0
-    if longer[0] > 1:
-        first = next(place for place, errors in enumerate(longer) if errors <= 1)
-        over, under = longer[first - 1 : first + 1]
-        share = (over - 1) / (over - under)
-        misfit = float(MISFITS[0] * 2.0 ** (places[first - 1] + share * (places[first] - places[first - 1])))
     # In a canopy neighbours are in the stack too: no more than descriptions allow.
     allowed = between[np.interp(between, places, longer) <= SURE]
     misfit = max(misfit, min(missed, float(MISFITS[0] * 2.0 ** max(allowed, default=0.0))))
