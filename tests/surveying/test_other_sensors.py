@@ -225,7 +225,7 @@ def test_tails_far_below_a_thousandth_are_known_where_echoes_are_so_high():
     assert judge(block, time)[2] > 0.85
 
 
-def search_misfit(monkeypatch, cost, loud, change):
+def search_misfit(monkeypatch, cost, loud, change, whitening=()):
     """Misfit and doubt where a misfit at a place costs so much, and the places that were looked at."""
     scatter, looked = np.resize([1.0, -1.0], 100), []
 
@@ -240,8 +240,8 @@ def search_misfit(monkeypatch, cost, loud, change):
 
     monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
     monkeypatch.setattr(choose_pulse, "_explain_between", explain_between)
-    block = record(gaussian, 5, n=100)[0]
-    return *choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0, change)[:2], looked
+    block, system = record(gaussian, 5, n=100)[0], SystemPulse(2.0, noise=ReceiverNoise(whitening=whitening))
+    return *choose_pulse._choose_misfit(block, system, 0.0, change)[:2], looked
 
 
 def test_no_misfit_is_looked_for_below_none(monkeypatch):
@@ -265,6 +265,8 @@ def test_the_least_misfit_is_looked_for_between_those_that_are_doublings(monkeyp
     misfit, _, looked = search_misfit(monkeypatch, cost, None, 0.0)
     assert {3.5, 3.75} <= set(looked)
     assert 3.5 < np.log2(misfit / choose_pulse.MISFITS[0]) <= 3.75
+    whitened = search_misfit(monkeypatch, cost, None, 0.0, (0.6, 0.0))[0]
+    assert whitened == choose_pulse.MISFITS[4], "less than the shortest makes echoes of what the pulse lacks"
 
 
 @pytest.mark.parametrize(

@@ -545,7 +545,8 @@ def settle(
 def _choose_misfit(
     block: WaveformBlock, system: SystemPulse, seen: float, change: float, missed: float = 0.0
 ) -> tuple[float, float, Explained]:
-    """The least misfit that describes in at most one standard error more than the shortest, its doubt, and its echoes.
+    """The least misfit that describes in at most one standard error more than the shortest, or the shortest where fits
+    are whitened; its doubt, and its echoes.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
     much of it neighbours are not found, and both lengthen the description. Where it begins to be as short, steps are
@@ -592,11 +593,13 @@ def _choose_misfit(
     while longer[0] <= 1 and min(lengths) > 0:  # what was looked at last may be the shortest
         best, longer = look(min(lengths) - 1)
     places, misfit = sorted(lengths), 0.0
-    while longer[0] > 1:
-        first = next(place for place, errors in enumerate(longer) if errors <= 1)
+    # A filter for noise makes echoes of what the pulse lacks: with less misfit than the best, whitened fits add them.
+    most = 0.0 if system.noise.whitening else 1.0
+    while longer[0] > most:
+        first = next(place for place, errors in enumerate(longer) if errors <= most)
         (before, after), (over, under) = places[first - 1 : first + 1], longer[first - 1 : first + 1]
         if after - before <= FINEST:
-            misfit = float(MISFITS[0] * 2.0 ** (before + (over - 1) / (over - under) * (after - before)))
+            misfit = float(MISFITS[0] * 2.0 ** (before + (over - most) / (over - under) * (after - before)))
             break
         best, longer = look((before + after) / 2)
         places = sorted(lengths)
