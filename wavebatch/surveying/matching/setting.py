@@ -463,7 +463,7 @@ def find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray)
     """Yield errors and slopes over time of light in cells of the ground of two sizes: medians over the cells, since a
     field's border in some of them says nothing."""
     for number in CELLS:
-        across, up, first, cell, count = _cut_cells(place, number)
+        across, up, first, cell, count = cut_cells(place, number)
         off, bright = (one - (np.bincount(cell, one) / count)[cell] for one in (time, light))
         weight = np.bincount(cell, off * off)
         good = (count >= LEAST_OF_CELL) & (weight > 0.0)
@@ -477,9 +477,9 @@ def find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray)
             yield MEDIAN_ERROR * scatter * (alike / len(slope)) ** 0.5, middle
 
 
-def _cut_cells(place: np.ndarray, number: int) -> tuple[np.ndarray, ...]:
-    """Cells of the ground in which so many places lie in the mean: column and row of the cell of each place, the first
-    place of each cell, the cell of each place, and how many each cell has."""
+def cut_cells(place: np.ndarray, number: int) -> tuple[np.ndarray, ...]:
+    """Return cells of the ground in which so many places lie in the mean: column and row of the cell of each place, the
+    first place of each cell, the cell of each place, and how many each cell has."""
     low, high = place.min(axis=1), place.max(axis=1)
     size = max(float(np.sqrt(np.prod(high - low) * number / place.shape[1])), 1e-3)
     across, up = ((place - low[:, None]) // size).astype(np.int64)
@@ -492,7 +492,7 @@ def _compare_lines(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, ch
     order = np.argsort(time, kind="stable")
     line = np.empty(len(time), np.int64)
     line[order] = np.cumsum(np.append(False, np.diff(time[order]) > BREAK))
-    *_, cell, count = _cut_cells(place, CELLS[0])
+    *_, cell, count = cut_cells(place, CELLS[0])
     whole, found, lines = np.bincount(cell, light), [NO_CHANGE], int(line.max()) + 1
     for number in range(lines if lines > 1 else 0):
         own = line == number

@@ -15,15 +15,18 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import even_places
+from wavebatch.core.order import even_places, robust_std
 from wavebatch.files.pulse_energy import COLUMN, LEAST_KNOWN, LEAST_SHARE, PulseEnergy, find_column, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import CHANGE_CHANCE, Calibration
 from wavebatch.surveying.matching.setting import (
+    BORDER,
+    CELLS,
     QUANTILES,
     SCANNERS,
     compare_scenes,
+    cut_cells,
     find_growth_in_cells,
     take_off_level,
     weigh_alike,
@@ -45,15 +48,13 @@ SAME_TOP, SURFACES = 0.84, 0.6
 leave: one, since two are the same also where even ground is weak or clipped; and by how much surfaces of one strip
 differ in brightness: real and simulated ones by 0.1 to 0.9 (robust standard deviation of the logarithm)."""
 
-PERIODS = (2, 3, 4)
-"""Lasers, or heads, that may take turns."""
-
-LEAST_APART, LIKE = 0.04, 0.5
-"""Light alternates where that of neighbours differs by more than the first (median of the logarithm), and that of
-pulses one period apart by this share of it at most: surfaces make pulses that lie further apart differ more."""
+LEAST_APART, SURE_TURNS, CYCLES = 0.04, 6.0, 4
+"""Light takes turns where that of two lasers differs by more than the first (logarithm), and by so many errors in cells
+of either size: the strongest period counts, so that sound scenes reach 4, rows of plants 5.3, and 12 in one size;
+and fewest periods that show it."""
 
 LEAST_COMPARED = 200
-"""Pairs of pulses that show it."""
+"""Pulses that show either."""
 
 PLACES, OF_PLACE, LEAST_PLACES = 32, 128, 8
 """Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest."""
@@ -159,17 +160,7 @@ def take_energies(
                 f"{energy.source}: {1.0 - energy.known:.0%} of the pulses have none and count as of mean energy: "
                 f"{'; '.join(said)}{remedy}"
             )
-    # By how much the logarithm of the light of neighbouring pulses of one channel differs in turns; 0 where not.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        light = np.log(pulses[1] / pulses[2])
-    apart = 0.0
-    for channel in np.unique(pulses[3]):
-        # Packets without signal, and pulses of unknown energy, have no light to compare.
-        own = light[(pulses[3] == channel) & np.isfinite(light)]
-        if len(own) > LEAST_COMPARED:
-            near, *far = (float(np.nanmedian(np.abs(own[k:] - own[:-k]))) for k in (1, *PERIODS))
-            apart = max(apart, near) if near > LEAST_APART and min(far) < LIKE * near else apart
-    follows = _find_following(pulses)
+    follows, apart, period = _find_gains(pulses)
     if follows:
         notes.append(
             "the gain of the receiver follows the light of the last pulses, or packets were scaled one by one: light "
@@ -179,10 +170,11 @@ def take_energies(
         growth = math.hypot(growth, follows)
     if apart:
         notes.append(
-            f"the light of neighbouring pulses alternates by a factor of {math.exp(-apart):.2f}, as of two lasers or "
-            f"gains without a mark: {100 * apart * 0.5**0.5:.0f} % of error of calibrated values; give --energy"
+            f"light alternates by a factor of {math.exp(-apart):.2f} within about {period} pulses of a channel, as of "
+            f"two lasers or gains without a mark: {100 * math.expm1(apart):.0f} % of error of calibrated values; give "
+            "--energy"
         )
-        growth = math.hypot(growth, apart * 0.5**0.5)
+        growth = math.hypot(growth, math.expm1(apart))  # any target may be that of one of them
     # An error of the log from shot to shot that was not in the calibration's.
     measured = max((row.shot_energy for row in calibration.channels), default=0.0) if calibration else 0.0
     noise, lacks = math.sqrt(max(noise * energy.shots**2 - measured**2, 0.0)) if energy else 0.0, 0.0
@@ -205,29 +197,50 @@ def take_energies(
     return StripEnergies(replace(energy, missed=math.hypot(lacks, noise)), 0.0, growth, tuple(notes))
 
 
-def _find_following(pulses: np.ndarray) -> float:
-    """By how much a gain varies that follows the light of the last pulses, or of each, relative; 0 where none is seen;
-    pulses: as `_join`.
+def _find_gains(pulses: np.ndarray) -> tuple[float, float, int]:
+    """By how much a gain varies that follows the light of the last pulses, or of each, relative; by how much light
+    takes turns (logarithm), and after how many pulses; 0 where none is seen; pulses: as `_join`.
 
     Within small cells of the ground, light is compared with that of the pulses before over that of those after: a scene
-    has no direction in time, a receiver has.
+    has no direction in time, a receiver has. Lasers take turns after a whole number of pulses, while the pulses of a
+    cell are of several scan lines.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        found, light = 0.0, pulses[1] / pulses[2]
-        for channel in np.unique(pulses[3]):
-            own = (pulses[3] == channel) & (light > 0.0) & np.isfinite(light + pulses[5] + pulses[6])
-            seen, top = light[own], pulses[4, own] / pulses[2, own]
-            if len(top) > LEAST_COMPARED and np.median(top) and np.mean(top == np.median(top)) > SAME_TOP:
-                found = SURFACES
-            whole = np.cumsum(np.append(0.0, seen))
-            for size in (memory for memory in MEMORIES if len(seen) > 4 * memory):
-                near = whole[size:] - whole[:-size]
-                before, after = np.log(near[: -size - 1]), np.log(near[size + 1 :])
-                here = np.log(seen[size:-size]), pulses[5:, own][:, size:-size]
-                for error, slope in islice(find_growth_in_cells(before - after, *here), 1):
-                    gain = HELD * -2.0 * slope * float(np.std(before))
-                    found = max(found, gain * (slope < -SURE * error))
-    return found
+        found, turns, light = 0.0, (0.0, 0), pulses[1] / pulses[2]
+    for channel in np.unique(pulses[3]):
+        own = (pulses[3] == channel) & (light > 0.0) & np.isfinite(light + pulses[5] + pulses[6])
+        seen, top, place = light[own], pulses[4, own] / pulses[2, own], pulses[5:, own]
+        if len(seen) <= LEAST_COMPARED:
+            continue
+        if np.median(top) and np.mean(top == np.median(top)) > SAME_TOP:
+            found = SURFACES
+        whole = np.cumsum(np.append(0.0, seen))
+        for size in (memory for memory in MEMORIES if len(seen) > 4 * memory):
+            near = whole[size:] - whole[:-size]
+            before, after = np.log(near[: -size - 1]), np.log(near[size + 1 :])
+            here = np.log(seen[size:-size]), place[:, size:-size]
+            for error, slope in islice(find_growth_in_cells(before - after, *here), 1):
+                gain = HELD * -2.0 * slope * float(np.std(before))
+                found = max(found, gain * (slope < -SURE * error))
+        step = np.diff(pulses[0, own])
+        usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else np.inf
+        number = np.append(0, np.cumsum(np.minimum(np.rint(step / usual), NEIGHBOURS))).astype(np.int64)
+        early = number < 4 * NEIGHBOURS
+        number, bright, place = number[early], np.log(seen[early]), place[:, early]
+        periods = np.arange(2, number[-1] // CYCLES)
+        if not len(periods):
+            continue
+        *_, cell, count = cut_cells(place, CELLS[1])
+        rest = bright - (np.bincount(cell, bright) / count)[cell]
+        rest = np.clip(rest, -BORDER * robust_std(rest), BORDER * robust_std(rest))
+        lines = np.fft.rfft(np.bincount(number, rest), 8 * NEIGHBOURS)
+        rows = np.rint(8 * NEIGHBOURS / periods).astype(np.int64)
+        best = int(np.argmax(np.abs(lines[rows])))
+        turn = np.sign(np.cos(2.0 * np.pi * number / periods[best] + np.angle(lines[rows[best]])) + 1e-9)
+        shown = list(find_growth_in_cells(turn, bright, place))
+        if shown and all(slope > SURE_TURNS * error for error, slope in shown):
+            turns = max(turns, (2.0 * min(slope for _, slope in shown), int(periods[best])))
+    return found, *(turns if turns[0] > LEAST_APART else (0.0, 0))
 
 
 def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[float, str]:
