@@ -14,6 +14,7 @@ import json
 import os
 import random
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -64,15 +65,8 @@ SIGNALS: dict[str, tuple[int, ...]] = {
     "INT INT": (signal.SIGINT, signal.SIGINT), "TERM INT TERM": (signal.SIGTERM, signal.SIGINT, signal.SIGTERM),
     "INT KILL": (signal.SIGINT, signal.SIGKILL),
 }  # fmt: skip
-ATTACKS = (
-    *SIGNALS,
-    "group INT",
-    "group TERM",
-    "worker KILL",
-    "worker STOP CONT",
-    "worker STOP INT",
-    "worker STOP KILL",
-)
+WORKERS = ("worker KILL", "worker STOP CONT", "worker STOP INT", "worker STOP KILL")
+ATTACKS = (*SIGNALS, "group INT", "group TERM", *WORKERS)
 
 
 _PACKAGE = os.path.dirname(wavebatch.__file__) + os.sep
@@ -186,11 +180,12 @@ class Attacker:
         try:
             said = process.communicate(timeout=self.longest)[1]
         except subprocess.TimeoutExpired:
-            return is_ready, "hangs", "; ".join(map(_describe, _session(process.pid))) + _stacks(process)
+            return is_ready, "hangs", _stacks(process)
         return is_ready, process.returncode, said
 
     def _disturb_worker(self, parent: int, actions: list[str]) -> None:
-        workers = [pid for pid in _children(parent) if b"spawn_main" in _command_line(pid)]
+        children = map(int, _read_process(parent, f"task/{parent}/children").split())
+        workers = [pid for pid in children if "spawn_main" in _command_line(pid)]
         if actions == ["STOP", "KILL"]:  # one that is stopped while Python starts in it cannot be woken
             workers = [pid for pid in workers if _has_signal(pid, "SigIgn", signal.SIGINT)]
         if not workers:
@@ -206,7 +201,7 @@ class Attacker:
         deadline = time.monotonic() + self.stay
         while (left := _session(process.pid)) and time.monotonic() < deadline:
             time.sleep(0.01)
-        found = [_command_line(pid).replace(b"\0", b" ").decode()[:200] for pid in left]
+        found = [_command_line(pid) for pid in left]
         for pid in left:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -252,9 +247,8 @@ class Attacker:
         if code == 0 and whole.keys() != sound.keys():
             return f"exit code 0, but {sorted(sound.keys() - whole.keys())} are missing"
         for name in whole:
-            if name.endswith(".report.json") and not {name.replace(".report.json", s) for s in (".laz", ".las")} & set(
-                whole
-            ):
+            base = name.removesuffix(".report.json")
+            if base != name and not {f"{base}.laz", f"{base}.las"} & set(whole):
                 return f"{name} without its cloud"
         return ""
 
@@ -269,12 +263,9 @@ class Attacker:
             in_child(work)
         except AssertionError as error:
             return f"cannot be run again: {error}"
-        found = {**_contents(out), "all.json": self.sound[name].get("all.json")}  # it says what is new
-        if found["all.json"] is None:
-            del found["all.json"]
-        different = sorted(
-            key for key in found.keys() | self.sound[name].keys() if found.get(key) != self.sound[name].get(key)
-        )
+        found, sound = _contents(out), self.sound[name]
+        different = [key for key in sorted(found.keys() | sound.keys())
+                     if key != "all.json" and found.get(key) != sound.get(key)]  # it says what is new  # fmt: skip
         return f"run again: other bytes in {different}" if different else ""
 
 
@@ -305,9 +296,8 @@ def _listen() -> None:
 
 
 def _empty(folder: Path) -> None:
-    for path in sorted(folder.rglob("*"), reverse=True) if folder.exists() else ():
-        path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
-    folder.mkdir(exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
 
 
 def _contents(folder: Path) -> dict[str, object]:
@@ -334,12 +324,17 @@ def _handles_signals(pid: int) -> bool:
 
 def _has_signal(pid: int, name: str, number: int) -> bool:
     """Whether a signal is among those that a process catches (name SigCgt) or ignores (SigIgn); True if it is gone."""
+    lines = _read_process(pid, "status").decode().splitlines()
+    signals = [int(line.split()[1], 16) for line in lines if line.startswith(name)]
+    return not signals or bool(signals[0] >> (number - 1) & 1)
+
+
+def _read_process(pid: int | str, name: str) -> bytes:
+    """What Linux says of a process; nothing if it is gone."""
     try:
-        with open(f"/proc/{pid}/status") as file:
-            signals = next((int(line.split()[1], 16) for line in file if line.startswith(name)), 0)
+        return Path(f"/proc/{pid}/{name}").read_bytes()
     except OSError:
-        return True
-    return bool(signals >> (number - 1) & 1)
+        return b""
 
 
 def _lost_its_parent(code: int | str, said: str) -> bool:
@@ -354,52 +349,30 @@ def has_not_begun(is_ready: bool, code: int | str, said: str) -> bool:
     return code < 0 or (code == 1 and "KeyboardInterrupt" in said and f'File "{_PACKAGE}' not in said)
 
 
-def _children(pid: int) -> list[int]:
-    try:
-        with open(f"/proc/{pid}/task/{pid}/children") as file:
-            return [int(word) for word in file.read().split()]
-    except OSError:
-        return []
-
-
-def _command_line(pid: int) -> bytes:
-    try:
-        with open(f"/proc/{pid}/cmdline", "rb") as file:
-            return file.read()
-    except OSError:
-        return b""
-
-
-def _describe(pid: int) -> str:
-    """State and place of a process that hangs."""
-    found = [str(pid), _command_line(pid).replace(b"\0", b" ").decode(errors="replace")[-60:]]
-    for name in ("wchan", "stat"):
-        with contextlib.suppress(OSError), open(f"/proc/{pid}/{name}") as file:
-            found.append(file.read().rpartition(")")[2][:20])
-    return " ".join(found)
+def _command_line(pid: int) -> str:
+    return _read_process(pid, "cmdline").replace(b"\0", b" ").decode(errors="replace")[:200]
 
 
 def _stacks(process: subprocess.Popen) -> str:
-    """Where the threads of a process that hangs are, as faulthandler writes it."""
-    for pid in _session(process.pid):
-        if pid != process.pid:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+    """The processes that hang, and where the threads of the first one are, as faulthandler writes it."""
+    others = [pid for pid in _session(process.pid) if pid != process.pid]
+    said = "; ".join(map(_command_line, others))
+    for pid in others:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
     process.send_signal(signal.SIGABRT)
     with contextlib.suppress(subprocess.TimeoutExpired):
-        return process.communicate(timeout=10)[1][-3000:]
-    return ""
+        said += process.communicate(timeout=10)[1][-3000:]
+    return said
 
 
 def _session(number: int) -> list[int]:
     """Living processes of a session."""
     found = []
-    for name in os.listdir("/proc"):
-        if name.isdigit():
-            with contextlib.suppress(OSError), open(f"/proc/{name}/stat") as file:
-                state, _, _, session = file.read().rpartition(")")[2].split()[:4]
-                if int(session) == number and state not in "ZX":
-                    found.append(int(name))
+    for name in filter(str.isdigit, os.listdir("/proc")):
+        state, _, _, session = (_read_process(name, "stat").rpartition(b")")[2].split() or [b"X"] * 4)[:4]
+        if session == b"%d" % number and state not in b"ZX":
+            found.append(int(name))
     return found
 
 

@@ -140,7 +140,7 @@ def test_a_failing_case_is_made_small(fuzzer):
 
     def look(words):
         for name in words:
-            if name.endswith(".las") and os.path.exists(name):
+            if name.endswith(".las") and os.path.isfile(name):
                 with open(name, "rb") as file:
                     assert file.read(4) == b"LASF"
 

@@ -13,13 +13,16 @@ import random
 import re
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
+
+from wavebatch.files.las.header import STANDARD_DTYPES
 
 Edit = list
 """One of
 
-- ["set", place, hex], ["every", place, step, count, hex], ["fill", place, bytes, hex]: bytes are overwritten
-- ["insert", place, hex, times], ["delete", place, bytes], ["swap", place, bytes, hex]
+- ["swap", place, bytes, hex, times]: bytes from a place on are replaced by those in hex, so many times
+- ["every", place, step, count, hex]: bytes of `count` records of `step` bytes are overwritten
 - ["take", kind]: all is replaced by the sound input of another kind
 - ["member", name, edit]: of a file in a .npz, which is packed again, so that its checksum is right.
 """
@@ -28,55 +31,30 @@ Edit = list
 def apply_edits(data: bytes, edits: list[Edit], sound: Mapping[str, bytes] | None = None) -> bytes:
     """Return the damaged bytes; sound: inputs by kind, for "take"."""
     damaged = bytearray(data)
-    for edit in edits:
-        _apply(damaged, edit, sound or {})
+    for name, place, *rest in edits:
+        if name == "swap":
+            length, new, times = rest
+            damaged[place : place + length] = bytes.fromhex(new) * times
+        elif name == "every":
+            step, count, new = rest
+            for at in range(place, min(place + step * count, len(damaged)), step):
+                damaged[at : at + len(new) // 2] = bytes.fromhex(new)
+        elif name == "take":
+            damaged[:] = (sound or {})[place]
+        else:
+            damaged[:] = _repack(bytes(damaged), place, rest[0])
     return bytes(damaged)
-
-
-def _apply(data: bytearray, edit: Edit, sound: Mapping[str, bytes]) -> None:
-    name, place, *rest = edit
-    if name == "set":
-        _put(data, place, rest[0])
-    elif name == "every":
-        for k in range(rest[1]):
-            _put(data, place + k * rest[0], rest[2])
-    elif name == "fill":
-        pattern = bytes.fromhex(rest[1])
-        end = min(place + rest[0], len(data))
-        data[place:end] = (pattern * ((end - place) // len(pattern) + 1))[: max(end - place, 0)]
-    elif name == "insert":
-        data[place:place] = bytes.fromhex(rest[0]) * rest[1]
-    elif name == "delete":
-        del data[place : place + rest[0]]
-    elif name == "swap":
-        data[place : place + rest[0]] = bytes.fromhex(rest[1])
-    elif name == "take":
-        data[:] = sound[place]
-    else:
-        data[:] = _repack(bytes(data), place, rest[0])
-
-
-def _put(data: bytearray, place: int, what: str) -> None:
-    if place <= len(data):
-        data[place : place + len(what) // 2] = bytes.fromhex(what)
 
 
 def _repack(data: bytes, name: str, edit: Edit) -> bytes:
     packed = io.BytesIO()
+    broken = zipfile.BadZipFile, zipfile.LargeZipFile, OSError, EOFError, ValueError, NotImplementedError, zlib.error
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as new:
             for member in old.namelist():
                 content = old.read(member)
                 new.writestr(zipfile.ZipInfo(member), apply_edits(content, [edit]) if member == name else content)
-    except (
-        zipfile.BadZipFile,
-        zipfile.LargeZipFile,
-        OSError,
-        EOFError,
-        ValueError,
-        NotImplementedError,
-        zipfile.zlib.error,
-    ):
+    except broken:
         return data  # an earlier edit has damaged the file
     return packed.getvalue()
 
@@ -118,23 +96,20 @@ def _damage_bytes(data: bytes, fields: list[tuple[int, str, int, int]], rng: ran
     if fields and rng.random() < 0.8:
         return _damage_field(data, *rng.choice(fields), rng)
     at = rng.randrange(700 if rng.random() < 0.5 and len(data) > 700 else max(len(data), 1))
-    choice = rng.random()
-    if choice < 0.1:
-        return ["delete", at, len(data)]
-    if choice < 0.2:
-        return ["delete", at, rng.choice([1, 4, 60])]
-    if choice < 0.3:
-        return ["insert", at, rng.randbytes(rng.choice([1, 4])).hex(), rng.choice([1, 15])]
-    if choice < 0.4:
-        return [
-            "fill",
-            at,
-            rng.choice([100, 1000, 10_000]),
-            rng.choice(["00", "ff", "80", "7f", rng.randbytes(7).hex()]),
-        ]
-    width = rng.choice([1, 2, 4, 8])
+    width, many = rng.choice([1, 2, 4, 8]), rng.choice([100, 1000, 10_000])
+    some = rng.choice([b"\0", b"\xff", b"\x80", b"\x7f", rng.randbytes(7)])
     values = [b"\xff" * width, bytes(width), rng.randbytes(width), bytes(width - 1) + b"\x80", b"\0" * 6 + b"\xf8\x7f"]
-    return ["set", at, rng.choice(values).hex()]
+    value = rng.choice(values)
+    return _swap(at, rng, [
+        (1, len(data), b"", 1), (1, rng.choice([1, 4, 60]), b"", 1), (1, 0, rng.randbytes(4), rng.choice([1, 15])),
+        (1, many, some, many // len(some)), (6, len(value), value, 1),
+    ])  # fmt: skip
+
+
+def _swap(place: int, rng: random.Random, ways: list[tuple[float, int, bytes, int]]) -> Edit:
+    """One of some swaps at a place; ways: how often it is drawn, bytes that go, bytes that come, and how many times."""
+    _, length, new, times = rng.choices(ways, [often for often, *_ in ways])[0]
+    return ["swap", place, length, new.hex(), times]
 
 
 def _damage_field(data: bytes, place: int, form: str, step: int, count: int, rng: random.Random) -> Edit:
@@ -143,7 +118,7 @@ def _damage_field(data: bytes, place: int, form: str, step: int, count: int, rng
     k = rng.randrange(count)
     value = odd_value(data[place + k * step : place + k * step + size], form, rng).hex()
     if count == 1 or rng.random() < 0.4:
-        return ["set", place + k * step, value]
+        return ["swap", place + k * step, size, value, 1]
     stride = rng.choice([1, 1, 2, 7])
     return ["every", place, step * stride, count // stride, value]
 
@@ -153,23 +128,13 @@ def odd_value(now: bytes, form: str, rng: random.Random) -> bytes:
     size = struct.calcsize("<" + form)
     now = now.ljust(size, b"\0")
     if form.endswith("s"):
-        texts = [
-            b"",
-            b"\xff" * size,
-            b"\x1b[2J",
-            b"a" * size,
-            rng.randbytes(size),
-            now[::-1],
-            b"LASF_Spec",
-            b"\0" + now,
-        ]
+        texts = [b"", b"\xff" * size, b"\x1b[2J", b"a" * size, rng.randbytes(size), now[::-1], b"LASF_Spec", b"\0a"]
         return rng.choice(texts)[:size].ljust(size, b"\0")
     if form in "fd":
         value = struct.unpack("<" + form, now)[0]
         values = [0.0, -0.0, float("nan"), float("inf"), float("-inf"), 1e-38, 3e38, -3e38, 1e-9, 1.0, -1.0, 1e6]
-        values += [value * factor for factor in (-1, 2, 0.5, 1000, 1e-3, 1.001)] + [5e-324, 1e300, -1e300] * (
-            form == "d"
-        )
+        values += [value * factor for factor in (-1, 2, 0.5, 1000, 1e-3, 1.001)]
+        values += [5e-324, 1e300, -1e300] if form == "d" else []
         try:
             return struct.pack("<" + form, rng.choice(values))
         except (OverflowError, ValueError):
@@ -196,7 +161,7 @@ def _damage_record(data: bytes, place: int, length: int, rng: random.Random) -> 
     start, end = rng.choice(tokens)
     others = [text[slice(*rng.choice(tokens))] for _ in range(20)]
     fitting = [value for value in [*_NUMBERS, *_ODD, *others] if len(value) <= end - start]
-    return ["set", place + start, rng.choice(fitting).ljust(end - start).hex()]
+    return ["swap", place + start, end - start, rng.choice(fitting).ljust(end - start).hex(), 1]
 
 
 def _list_records(data: bytes) -> Iterator[tuple[int, bytes, int, int]]:
@@ -229,30 +194,20 @@ def _damage_npz(data: bytes, fields: list, rng: random.Random) -> Edit:
 
 
 def _damage_text(data: bytes, fields: list, rng: random.Random, offset: int = 0) -> Edit:
-    at, choice = rng.randrange(max(len(data), 1)), rng.random()
-    tokens = [match.span() for match in _TOKEN.finditer(data)]
+    at, size = rng.randrange(max(len(data), 1)), max(len(data), 1)
+    start, end = rng.choice([match.span() for match in _TOKEN.finditer(data)] or [(at, at + 1)])
     ends = list(itertools.accumulate(map(len, data.splitlines(keepends=True)), initial=0))
     lines = list(itertools.pairwise(ends)) or [(0, len(data))]
-    if choice < 0.45 and tokens:
-        start, end = rng.choice(tokens)
-        other = data[slice(*rng.choice(tokens))]
-        return ["swap", start + offset, end - start, rng.choice([*_NUMBERS, *_ODD, other, other, other]).hex()]
-    if choice < 0.55:
-        start, end = rng.choice(lines)
-        return ["delete", start + offset, end - start]
-    if choice < 0.62:
-        start, end = rng.choice(lines)
-        return ["insert", rng.choice(lines)[0] + offset, data[start:end].hex(), rng.choice([1, 3, 100])]
-    if choice < 0.72:
-        return ["delete", at + offset, rng.choice([1, 5, 40, len(data)])]
-    if choice < 0.78:
-        return ["insert", at + offset, rng.choice(_ODD).hex(), rng.choice([500, 5000, 100_000])]
-    if choice < 0.85:
-        part = data[at : at + rng.choice([5, 50, 500])]
-        return ["insert", rng.randrange(max(len(data), 1)) + offset, part.hex(), rng.choice([1, 3])]
-    if choice < 0.95:
-        return ["insert", at + offset, rng.choice(_ODD).hex(), 1]
-    return ["set", at + offset, rng.choice(_ODD).hex()]
+    (first, last), odd = rng.choice(lines), rng.choice(_ODD)
+    other = data[slice(*rng.choice([match.span() for match in _TOKEN.finditer(data)] or [(0, 1)]))]
+    part = data[at : at + rng.choice([5, 50, 500])]
+    often, place, length, new, times = rng.choices(ways := [
+        (45, start, end - start, rng.choice([*_NUMBERS, *_ODD, other, other, other]), 1),
+        (10, first, last - first, b"", 1), (7, rng.choice(lines)[0], 0, data[first:last], rng.choice([1, 3, 100])),
+        (10, at, rng.choice([1, 5, 40, size]), b"", 1), (6, at, 0, odd, rng.choice([500, 5000, 100_000])),
+        (7, rng.randrange(size), 0, part, rng.choice([1, 3])), (10, at, 0, odd, 1), (5, at, len(odd), odd, 1),
+    ], [way[0] for way in ways])[0]  # fmt: skip
+    return ["swap", place + offset, length, new.hex(), times]
 
 
 # ----------------------------------------------------------------------------------------------------- fields
@@ -263,46 +218,32 @@ def list_fields(data: bytes, kind: str) -> list[tuple[int, str, int, int]]:
     if kind.endswith((".las", ".laz")):
         return list(_las_fields(data))
     if kind.endswith(".wdp"):
-        return [(0, "H", 0, 1), (2, "16s", 0, 1), (18, "H", 0, 1), (20, "Q", 0, 1), (60, "B", 1, len(data) - 60)]
+        return [*_fields("H16sHQ"), (60, "B", 1, len(data) - 60)]
     if kind.endswith(".sbet"):
-        return [(8 * k, "d", 136, len(data) // 136) for k in range(17)]
+        return _fields("17d", 0, 136, len(data) // 136)
     return []
 
 
-_HEADER = [
-    (4, "H"), (6, "H"), (8, "16s"), (24, "B"), (25, "B"), (26, "32s"), (58, "32s"), (94, "H"), (96, "I"), (100, "I"),
-    (104, "B"), (105, "H"), (107, "I"),
-    *((111 + 4 * k, "I") for k in range(5)), *((131 + 8 * k, "d") for k in range(12)),
-    (227, "Q"),
-]  # fmt: skip
-_HEADER_14 = [(235, "Q"), (243, "I"), (247, "Q"), *((255 + 8 * k, "Q") for k in range(15))]
-_DESCRIPTOR = [(0, "B"), (1, "B"), (2, "I"), (6, "I"), (10, "d"), (18, "d")]
-_EXTRA = [
-    (2, "B"),
-    (3, "B"),
-    (4, "32s"),
-    (40, "d"),
-    (40, "Q"),
-    (64, "d"),
-    (88, "d"),
-    (112, "d"),
-    (136, "d"),
-    (160, "32s"),
-]
-_LASZIP = [(0, "H"), (2, "H"), (4, "B"), (5, "B"), (6, "H"), (8, "I"), (12, "I"), (16, "q"), (24, "q"), (32, "H")]
-_OLD_POINT = [(0, "i"), (4, "i"), (8, "i"), (12, "H"), (14, "B"), (15, "B"), (16, "b"), (17, "B"), (18, "H"), (20, "d")]
-_NEW_POINT = [(0, "i"), (4, "i"), (8, "i"), (12, "H"), (14, "B"), (15, "B"), (16, "B"), (17, "B"), (18, "h"), (20, "H"),
-              (22, "d")]  # fmt: skip
-_WAVE = [(0, "B"), (1, "Q"), (9, "I"), (13, "f"), (17, "f"), (21, "f"), (25, "f")]
-_WAVES_AT = {4: 28, 5: 34, 9: 30, 10: 38}
+def _fields(layout: str, at: int = 0, step: int = 0, count: int = 1) -> list[tuple[int, str, int, int]]:
+    """The fields of a structure, written as for `struct`; step and count: of equal structures in a row."""
+    found = []
+    for number, letter in re.findall(r"(\d*)([a-zA-Z])", layout):
+        forms = [number + letter] if letter in "sx" else [letter] * int(number or 1)
+        for form in forms:
+            found += [] if letter == "x" else [(at, form, step, count)]
+            at += struct.calcsize("<" + form)
+    return found
+
+
+_HEADER = "4x2H16s2B32s32s4xH2IBHI5I12dQ"
+_DESCRIPTOR, _EXTRA, _LASZIP = "2B2I2d", "2x2B32s4xQ16xd16xd16xd16xd16x32s", "2H2BH2I2qH"
 
 
 def _las_fields(data: bytes) -> Iterator[tuple[int, str, int, int]]:
     def read(place: int, form: str) -> int:
         return struct.unpack_from("<" + form, data, place)[0]
 
-    header = [*_HEADER, *(_HEADER_14 if data[25] >= 4 else [])]
-    yield from [(place, form, 0, 1) for place, form in header] * 2
+    yield from _fields(_HEADER + "QI16Q" * (data[25] >= 4)) * 2
     for place, user, number, size in _list_records(data):
         yield from _vlr_fields(place, user, number, size)
     points, length, point_format = read(96, "I"), read(105, "H"), data[104]
@@ -313,34 +254,29 @@ def _las_fields(data: bytes) -> Iterator[tuple[int, str, int, int]]:
         yield from [(points + 8, "B", 1, max(table - points - 8, 1))] * 10
         yield (table + 8, "B", 1, max(len(data) - table - 8, 1))
     else:
-        fields = _OLD_POINT if point_format < 6 else _NEW_POINT
-        waves = _WAVES_AT.get(point_format)
-        fields = fields + [(waves + place, form) for place, form in _WAVE] * 2 if waves else fields
-        yield from [(points + place, form, length, count) for place, form in fields] * 2
-        end = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}[point_format]
-        yield from [(points + place, "f", length, count) for place in range(end, length - 3, 4)]
+        known = STANDARD_DTYPES[point_format]
+        for name, (dtype, place, *_) in known.fields.items():
+            often = 4 if name.startswith("wavepacket") or name in ("x_t", "y_t", "z_t") else 2
+            yield from [(points + place, {"<u8": "Q"}.get(dtype.str, dtype.char), length, count)] * often
+        yield from [(points + place, "f", length, count) for place in range(known.itemsize, length - 3, 4)]
     packets = read(227, "Q")
     if packets and packets + 60 < len(data):
-        yield from [(packets + place, form, 0, 1) for place, form in ((0, "H"), (2, "16s"), (18, "H"), (20, "Q"))]
-        yield from [
-            (packets + 60, "B", 1, len(data) - packets - 60),
-            (packets + 60, "H", 2, (len(data) - packets) // 2 - 30),
-        ]
+        rest = len(data) - packets
+        yield from _fields("H16sHQ", packets)
+        yield from [(packets + 60, "B", 1, rest - 60), (packets + 60, "H", 2, rest // 2 - 30)]
 
 
 def _vlr_fields(body: int, user: bytes, number: int, length: int) -> Iterator[tuple[int, str, int, int]]:
-    head = body - 54
-    yield from [(head + place, form, 0, 1) for place, form in ((0, "H"), (2, "16s"), (18, "H"), (20, "H"), (22, "32s"))]
+    yield from _fields("H16sHH32s", body - 54)
     if user == b"LASF_Spec" and 100 <= number <= 354:
-        yield from [(body + place, form, 0, 1) for place, form in _DESCRIPTOR] * 4
+        yield from _fields(_DESCRIPTOR, body) * 4
     elif user == b"LASF_Spec" and number == 4:
-        yield from [(body + place, form, 192, length // 192) for place, form in _EXTRA] * 2
+        yield from _fields(_EXTRA, body, 192, length // 192) * 2
     elif user == b"laszip encoded":
-        yield from [(body + place, form, 0, 1) for place, form in _LASZIP] * 2
-        yield from [(body + 34 + place, "H", 6, max((length - 34) // 6, 1)) for place in (0, 2, 4)] * 2
-    elif user == b"LASF_Projection" and number == 34735:
-        yield from [(body, "H", 2, length // 2)] * 4
-    elif user == b"LASF_Projection" and number == 34736:
-        yield from [(body, "d", 8, length // 8)] * 2
+        yield from _fields(_LASZIP, body) * 2
+        yield from _fields("3H", body + 34, 6, max((length - 34) // 6, 1)) * 2
+    elif user == b"LASF_Projection" and number in (34735, 34736):
+        form, size = ("H", 2) if number == 34735 else ("d", 8)
+        yield from [(body, form, size, length // size)] * 4
     elif length:
         yield (body, "B", 1, length)

@@ -15,12 +15,13 @@ import collections
 import contextlib
 import importlib
 import json
+import multiprocessing
 import os
 import random
 import re
 import resource
-import select
 import shlex
+import shutil
 import signal
 import stat
 import sys
@@ -28,7 +29,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,13 +51,14 @@ class Limits(NamedTuple):
 
     seconds: float = 10
     """Of a processor."""
-    waiting: float = 60
-    """Of a clock, while it does nothing."""
+    waiting: float = 300
+    """Of a clock: more than these seconds of a processor take on a busy machine."""
     memory: int = 1 << 30
     """Bytes that the process takes at most, with Python and NumPy."""
 
 
 PLAIN = Limits()
+FORK = multiprocessing.get_context("fork")
 GROUP = 40
 """Cases per process: what they leave in memory adds up."""
 
@@ -85,10 +87,13 @@ class Fuzzer:
         """What the last command did."""
         if not self.base.exists():
             self.base.mkdir()
-            _in_child(lambda: build_inputs(self.base))  # the threads that laspy starts here would be missing in forks
+            made = FORK.Process(target=build_inputs, args=(self.base,))  # threads of laspy would be missing in forks
+            made.start()
+            made.join()
+            assert made.exitcode == 0, "the sound inputs cannot be made"
         self.sound = dict(read_sound(self.base))
         self._kept = _state(self.base)
-        self._child: tuple[int, int, int] | None = None
+        self._child: tuple[Any, Any] | None = None
         self._served = 0
         for name in ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_svg", "rasterio"):
             with contextlib.suppress(ImportError):  # once, not in every process
@@ -96,12 +101,18 @@ class Fuzzer:
 
     def run(self, case: Case) -> str:
         """Run a case and return what is wrong, on one line."""
-        pid, target, source = self._child or self._start()
-        os.write(target, json.dumps(case).encode() + b"\n")
-        line, why = self._wait(pid, source)
-        self.last = json.loads(line) if line else {"code": -1, "out": "", "err": why, "why": why}
+        process, pipe = self._child or self._start()
+        pipe.send(case)
+        try:
+            why = "" if pipe.poll(self._limits.waiting) else f"waits for more than {self._limits.waiting} s"
+            self.last = {"code": -1, "out": "", "err": why, "why": why} if why else pipe.recv()
+        except EOFError:
+            process.join()
+            slow = process.exitcode == -signal.SIGPROF
+            why = f"ran for more than {self._limits.seconds} s" if slow else f"ended with status {-process.exitcode}"
+            self.last = {"code": -1, "out": "", "err": why, "why": why}
         self._served += 1
-        if not line or self.last["why"] or self._served == GROUP:
+        if self.last["why"] or self._served == GROUP:
             self.close()
         words = case.command.split()
         for name in (" ".join(words[: 1 + (words[0] == "plot")]), f"[{case.kind}]"):
@@ -113,67 +124,37 @@ class Fuzzer:
     def close(self) -> None:
         """End the process that runs the cases."""
         if self._child is not None:
-            pid, *pipes = self._child
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
-            for pipe in pipes:
-                os.close(pipe)
+            process, pipe = self._child
+            process.kill()
+            process.join()
+            pipe.close()
             self._child, self._served = None, 0
 
-    def _start(self) -> tuple[int, int, int]:
-        orders, target = os.pipe()
-        source, answers = os.pipe()
-        pid = os.fork()
-        if not pid:
-            os.close(target)
-            os.close(source)
-            self._serve(orders, answers)
-        os.close(orders)
-        os.close(answers)
-        self._child = pid, target, source
+    def _start(self) -> tuple[Any, Any]:
+        pipe, theirs = FORK.Pipe()
+        process = FORK.Process(target=self._serve, args=(theirs,))
+        process.start()
+        theirs.close()
+        self._child = process, pipe
         return self._child
 
-    def _serve(self, orders: int, answers: int) -> None:
-        """In the forked process: run the cases and write what each did, until one fails."""
-        try:
-            os.setsid()
-            libraries = tempfile.TemporaryFile()  # noqa: SIM115 - open until the process ends
-            for line in os.fdopen(orders):
-                with _stderr_into(libraries):
-                    found = self._run_here(Case(*json.loads(line)))
-                libraries.seek(0)
-                written = libraries.read()
-                libraries.seek(0)
-                libraries.truncate()
-                if written and not found["why"]:
-                    found["why"] = f"a library writes to stderr: {written[:300]!r}"
-                os.write(answers, json.dumps(found).encode() + b"\n")
-            os._exit(0)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            os._exit(99)
-
-    def _wait(self, pid: int, source: int) -> tuple[bytes, str]:
-        """The line that the process writes, or what is wrong."""
-        line = b""
-        used = seen = _processor_time(pid)
-        busy = time.monotonic()
-        while not line.endswith(b"\n"):
-            now = _processor_time(pid)
-            if select.select([source], [], [], 0.5)[0]:
-                data = os.read(source, 1 << 20)
-                if not data:
-                    return b"", f"the process ended with status {_wait_for(pid)}"
-                line += data
-            elif now - used > self._limits.seconds:
-                return b"", f"ran for more than {self._limits.seconds} s"
-            elif now - seen > 0.05:
-                seen, busy = now, time.monotonic()
-            elif time.monotonic() - busy > self._limits.waiting:
-                return b"", f"waits for more than {self._limits.waiting} s"
-        return line, ""
+    def _serve(self, pipe: Any) -> None:
+        """In the forked process: run the cases and send what each did, until one fails."""
+        os.setsid()
+        libraries = tempfile.TemporaryFile()  # noqa: SIM115 - open until the process ends
+        while True:
+            case = pipe.recv()
+            signal.setitimer(signal.ITIMER_PROF, self._limits.seconds)
+            with _stderr_into(libraries):
+                found = self._run_here(case)
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            libraries.seek(0)
+            written = libraries.read()
+            libraries.seek(0)
+            libraries.truncate()
+            if written and not found["why"]:
+                found["why"] = f"a library writes to stderr: {written[:300]!r}"
+            pipe.send(found)
 
     def _run_here(self, case: Case) -> dict[str, Any]:
         folder = self._folder / "case"
@@ -205,7 +186,7 @@ class Fuzzer:
 
     def _prepare(self, case: Case, folder: Path) -> tuple[list[str], dict[str, str], set[str]]:
         """The command with the damaged input in place, its variables, and the names that its folder holds before."""
-        _remove(folder)
+        shutil.rmtree(folder, ignore_errors=True)
         out = folder / "out"
         out.mkdir(parents=True)
         (folder / "tmp").mkdir()
@@ -244,33 +225,6 @@ def _stderr_into(file: Any) -> Iterator[None]:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-
-
-def _processor_time(pid: int) -> float:
-    """Seconds of a processor that a process took, with those of ended children."""
-    try:
-        numbers = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:15]
-    except OSError:
-        return 0.0
-    return sum(map(int, numbers)) / os.sysconf("SC_CLK_TCK")
-
-
-def _in_child(work: Callable[[], object]) -> None:
-    pid = os.fork()
-    if not pid:
-        try:
-            work()
-            os._exit(0)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            os._exit(1)
-    assert os.waitpid(pid, 0)[1] == 0, "the sound inputs cannot be made"
-
-
-def _wait_for(pid: int) -> int:
-    """The status of a child, which is left to be waited for."""
-    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT).si_status
 
 
 def _reset_peak() -> None:
@@ -396,18 +350,14 @@ def check_whole(path: Path) -> str:
             with rasterio.open(path) as file:
                 small = file.width * file.height < 10_000_000
                 file.read() if small else file.read(window=((0, 256), (0, 256)))
-        elif (
-            path.suffix == ".png"
-            and not path.read_bytes().endswith(b"IEND\xaeB`\x82")
-            or path.suffix == ".svg"
-            and not path.read_bytes().rstrip().endswith(b"</svg>")
-        ):
+        elif path.suffix in _END and not path.read_bytes().rstrip(b"\n").endswith(_END[path.suffix]):
             return "the picture has no end"
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return ""
 
 
+_END = {".png": b"IEND\xaeB`\x82", ".svg": b"</svg>"}
 _BEGIN = {".las": b"LASF", ".laz": b"LASF", ".npz": b"PK", ".png": b"\x89PNG", ".svg": b"<?xml", ".json": b"{",
           ".tif": b"II*"}  # fmt: skip
 
@@ -425,13 +375,6 @@ def _check_cloud(path: Path) -> str:
         with laspy.open(path) as file:
             count, points = file.header.point_count, file.read_points(-1)
     return "" if len(points) == count else f"{len(points)} points of {count}"
-
-
-def _remove(folder: Path) -> None:
-    for path in sorted(folder.rglob("*"), reverse=True) if folder.exists() else ():
-        path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
-    if folder.exists():
-        folder.rmdir()
 
 
 def draw_case(sound: dict[str, bytes], options: Options, rng: random.Random) -> Case:
@@ -459,22 +402,22 @@ def fuzz(fuzzer: Fuzzer, number: int, start: int, known: set[tuple[str, ...]], u
         if time.monotonic() > until and not failed:
             return
         why = fuzzer.run(case)
-        key = (case.kind, case.command.split()[0], re.sub(r"'.*?'|/\S*|[\d\W]+", " ", why)[:60])
-        if why and key not in known:
+        if why and _kind_of(case, why) not in known:
             failed.append((case, why))
-            raise AssertionError(key)
+            raise AssertionError(why)
 
     try:
         look()
-    except KeyboardInterrupt:
-        raise
-    except BaseException:
+    except Exception:
         if not failed:
             raise
-        case, why = failed[-1]
-        known.add((case.kind, case.command.split()[0], re.sub(r"'.*?'|/\S*|[\d\W]+", " ", why)[:60]))
-        return case, why
+        known.add(_kind_of(*failed[-1]))
+        return failed[-1]
     return None
+
+
+def _kind_of(case: Case, why: str) -> tuple[str, ...]:
+    return case.kind, case.command.split()[0], re.sub(r"'.*?'|/\S*|[\d\W]+", " ", why)[:60]
 
 
 def load_kept(path: Path = KEPT) -> list[Case]:
