@@ -23,11 +23,13 @@ from click.shell_completion import BashComplete
 from commands import run_command
 
 import wavebatch as wb
-from wavebatch.batch.options import EXCLUSIVE, NEEDS, NO_CHANGE, OPTIONS, RunOptions
+from wavebatch.batch.options import EXCLUSIVE, NEEDS, OPTIONS, SAME_CLOUD, RunOptions
+from wavebatch.batch.report_file import REQUESTED, describe_job
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli import command as program
 from wavebatch.cli.command import GROUPS, ProgramCommand, complete_files, roff
 from wavebatch.stages.chain import STAGES, Step, effective, parse_chain
+from wavebatch.tools.api import plan_run
 
 
 def invoke(*arguments, **environment):
@@ -75,8 +77,15 @@ def test_groups_name_options_that_exist_and_each_once():
     assert {tuple(name.rsplit(" ", 1)) for names in GROUPS.values() for name in names if " " in name} <= titled
     assert len(named) == len(set(named)) and not set(named) & set(OPTIONS)
     rivals = {name for group in (*EXCLUSIVE, *NEEDS.values(), NEEDS) for name in group}
-    assert [name for name in {*rivals, *program.NO_VARIABLE, *NO_CHANGE} if name not in known] == []
+    assert [name for name in {*rivals, *program.NO_VARIABLE, *SAME_CLOUD} if name not in known] == []
     assert set(named) - known == set()
+
+
+def test_resume_compares_every_option_that_may_change_a_cloud(tiny_strip):
+    (job,), _ = plan_run(tiny_strip, RunOptions("clouds"))
+    described = describe_job(job, {})["options"].keys()
+    assert OPTIONS.keys() - described == {*SAME_CLOUD, *REQUESTED} - {"columns"}
+    assert not set(SAME_CLOUD) & set(REQUESTED)
 
 
 def test_run_has_the_options_of_runoptions_and_python_the_same():

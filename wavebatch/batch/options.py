@@ -55,8 +55,8 @@ NEEDS = {
 MOST_JOBS = 1024
 """Most processes: more is a slip of the finger, and would stop the machine."""
 
-NO_CHANGE = ("output", "recursive", "jobs", "scheduler", "memory", "block_size", "overwrite", "resume")
-"""Options that do not change a cloud."""
+SAME_CLOUD = ("output", "recursive", "jobs", "scheduler", "memory", "block_size", "overwrite", "resume")
+"""Options that do not change a cloud; --resume makes clouds anew where any other option has changed."""
 
 
 def check_together(
@@ -244,7 +244,7 @@ class RunOptions:
         """Return the command that makes the cloud of a strip again; files have their names without folders."""
         parts = ["wavebatch run", shlex.quote(strip), "-o DIR"]
         for name, value in self.given().items():
-            if name in NO_CHANGE:
+            if name in SAME_CLOUD:
                 continue
             shipped = isinstance(value, str) and Path(value).name == value and not Path(value).suffix
             option = typed("profile" if name == "chain" and shipped else name)

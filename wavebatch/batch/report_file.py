@@ -20,6 +20,7 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
 from wavebatch.batch.job import StripJob, split_columns
+from wavebatch.batch.options import OPTIONS, SAME_CLOUD
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.echoes import REASONS, EchoFlag, NoData, without_nan
 from wavebatch.core.errors import StripWarning
@@ -38,11 +39,13 @@ from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 MOST_REPORT = 64 << 20
 """Most bytes of a report that are read; 255 digitizers take less than one."""
-WRITING = (
-    "direction", "headerless", "points", "format", "point_format", "las_version", "names", "no_data", "strict",
-    "keep_packets",
+REQUESTED = (
+    "chain", "profile", "tolerance", "system", "force", "survey", "calibration", "trajectory", "lever_arm", "crs",
+    "flight_height", "attenuation", "attenuation_error", "visibility", "wavelength", "energy", "where", "drop_flags",
+    "classes", "bbox", "polygon", "columns",
 )  # fmt: skip
-"""Options of a run that decide the output by their values; those that name files are in a report's `request`."""
+"""Options of a run that `describe_job` describes by what they lead to, for example a file by its contents. All others
+that may change a cloud are described by their values."""
 BATCH_SCHEMA = "wavebatch.batch-report/1"
 
 
@@ -78,7 +81,8 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     return {
         "version": __version__,
         "input": {"file": job.path.name, **fingerprint},
-        "options": {name: getattr(job.options, name) for name in WRITING} | {"columns": list(job.columns)},
+        "options": {name: getattr(job.options, name) for name in OPTIONS if name not in (*SAME_CLOUD, *REQUESTED)}
+        | {"columns": list(job.columns)},
         "request": {
             "chain": job.request.describe() or effective(job.chain),
             "system": None if saved is None else _hash_survey(saved),
