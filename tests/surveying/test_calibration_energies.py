@@ -193,6 +193,23 @@ def test_channels_of_two_gains_and_rows_of_plants_are_no_lasers_that_take_turns(
             assert not take_energies(reader, scan, None).notes
 
 
+def test_calibrate_takes_the_pulses_that_a_condition_chooses(tmp_path, flickering):
+    half = Facet(0.6, inside=lambda x, y: (x >= 40) & (x < 50) & (y >= 0) & (y < 20))
+    strip = write_strip(tmp_path / "s.las", [half, *FARMLAND], replace(FLICKERS, energy_spread=0.0), 8000, seed=14)
+    calibrate = ("calibrate", strip, "--targets", flickering / "t.csv", "-o", tmp_path / "c.toml", "--overwrite")
+    known = load_calibration(flickering / "with.toml").constant
+    done = call(*calibrate, "--where", "x > 500050.5 and number_of_returns == 1")
+    assert load_calibration(tmp_path / "c.toml").constant == pytest.approx(known, rel=0.005)
+    assert "echoes where x > 500050.5 and number_of_returns == 1" in load_calibration(tmp_path / "c.toml").conditions
+    assert "contradict" not in done.stderr and "scatter" not in done.stderr
+    call(*calibrate, "--where", "x < 500049.5")
+    assert load_calibration(tmp_path / "c.toml").constant == pytest.approx(known / 2, rel=0.005)
+    done = call(*calibrate, "--where", "classification == 99")
+    assert done.exit_code == 1 and "field: 0 clean single echoes, 10 are needed" in done.stderr
+    done = call(*calibrate, "--where", "echo_width > 2")
+    assert done.exit_code == 2 and "has no column 'echo_width'" in done.stderr
+
+
 @pytest.mark.slow
 def test_strips_of_a_flight_are_calibrated_with_one_unit_of_energy(tmp_path, flickering):
     b = replace(FLICKERS, gains={1: 0.8}, start=(98, 100), heading=270.0, time=START + 600)

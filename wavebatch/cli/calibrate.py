@@ -36,6 +36,7 @@ from wavebatch.tools.sheets.sheet import list_lines
 @shared.declared("energy")
 @shared.sensor_options
 @shared.declared("direction")
+@shared.where_option("Use only pulses with a return (a point of the strips)")
 @shared.html_option
 @shared.common_options("overwrite", "json")
 def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **options: Any) -> None:
@@ -61,6 +62,7 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
       # with light that falls across the swath
       wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml
     """  # fmt: skip
+    from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
     from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_targets
     from wavebatch.tools.api import find_request, read_sensor
@@ -79,7 +81,8 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
     shared.check_html(html_file)
     asked = shared.from_options(RunOptions, options)
     chain, request = find_request(asked)  # pulse and chain are chosen as `wavebatch run` chooses them
-    how = shared.from_options(CalibrationOptions, options, sensor=read_sensor(asked), chain=chain, request=request)
+    how = shared.from_options(CalibrationOptions, options, sensor=read_sensor(asked), chain=chain, request=request,
+                              chosen=PointFilter(where=options["where"]))  # fmt: skip
     flight = calibrate_flight(paths, load_targets(targets) if targets else [], how)
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)

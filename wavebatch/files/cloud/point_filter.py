@@ -1,7 +1,7 @@
 """Which points are used: flags, classes, box, polygons and --where, tested and counted in one place.
 
-`run`, `plot`, `stats`, `compare`, `grid` and `voxelize` make a PointFilter of their options. `plan` looks up its
-columns in a file, once; `PlannedFilter.test` tests the rows of every piece.
+`run`, `plot`, `stats`, `compare`, `grid`, `voxelize` and `calibrate` make a PointFilter of their options. `plan` looks
+up its columns in a file, once; `PlannedFilter.test` tests the rows of every piece.
 Before you change it: a row's values and its neighbours must not depend on what is written, only its return numbers do.
 """
 

@@ -21,6 +21,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, even_places, find_order, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
+from wavebatch.files.cloud.point_filter import PlannedFilter
 from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
 from wavebatch.files.las.header import locate, read_scanner, split_numbers
 from wavebatch.files.las.read_points import open_points
@@ -98,6 +99,14 @@ class Unit:
     vectors: packet_check.VectorDecision
     forms: Mapping[int, packet_check.SampleForm]
     """How samples are stored, by descriptor index; see `StripScan.forms`."""
+
+    def choose_packets(self, keep: PlannedFilter) -> np.ndarray:
+        """Return whether a point of each packet is kept, bool (packets,)."""
+        chosen = np.zeros(len(self.packets) + 1, bool)
+        chosen[self.packet_of_point[keep.test(self.points, len(self.points)) == 0]] = True
+        if len(self.context):
+            chosen[self.packet_of_context[keep.test(self.context, len(self.context)) == 0]] = True
+        return chosen[:-1]  # the last one is that of points without a packet, -1
 
 
 class StripReader(Closing):

@@ -19,6 +19,8 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.cloud.cloud_reader import CloudReader
+from wavebatch.files.cloud.point_filter import EVERY, PlannedFilter, PointFilter
 from wavebatch.files.pulse_energy import PulseEnergy, find_column, name_columns, take_records
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import StripScan
@@ -78,6 +80,8 @@ class CalibrationOptions:
     """Where packet vectors point: auto, toward or away."""
     energy: str | None = None
     """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
+    chosen: PointFilter = EVERY
+    """Only echoes of pulses with a chosen return count."""
     before: Calibration | None = None
     """Of the strips of the flight that were read before, by whose energies those of the next ones count."""
 
@@ -109,6 +113,8 @@ class EchoSource:
     """As `Calibration.haze`."""
     column: PulseEnergy | None = None
     """The extra byte whose values go with the echoes, if one was asked for."""
+    keep: PlannedFilter | None = None
+    """Chooses pulses by their returns; None: all."""
 
     @property
     def path(self) -> Path:
@@ -121,10 +127,12 @@ class EchoSource:
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
         for unit in self.reader.read_units(self.scan):
-            for block, _ in self.reader.read_blocks(unit, _BLOCK, owned_only=True):
+            chosen = True if self.keep is None else unit.choose_packets(self.keep)
+            for block, packets in self.reader.read_blocks(unit, _BLOCK, owned_only=True):
                 if block.returns is None:
                     continue
                 near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
+                near = near[np.broadcast_to(chosen, len(unit.packets))[packets[near]]]
                 if len(near):
                     part = block.rows(near)
                     records = take_records(part, unit)
@@ -151,6 +159,10 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
     InputError
         Where the strip cannot be read or the sensor's position is unknown.
     """
+    keep = None
+    if options.chosen:
+        with CloudReader(path) as cloud:
+            keep = cloud.plan(options.chosen)
     with StripReader(path, direction=options.direction) as reader, reader.scan() as scan:
         chain = options.chain or widest_chain()
         setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
@@ -171,7 +183,7 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         have = {step.stage.name for step in steps}
         steps += [Step(STAGES[name]) for name in ("attribute.position", f"attribute.{_LIGHT}") if name not in have]
         chain = replace(setup.chain, steps=tuple(steps))
-        yield EchoSource(reader, scan, setup.choice, chain, system, setup.sensor, setting, sent, air, haze, given)
+        yield EchoSource(reader, scan, setup.choice, chain, system, setup.sensor, setting, sent, air, haze, given, keep)
 
 
 def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None = None) -> np.ndarray:

@@ -513,7 +513,7 @@ def build_calibration(
     )
     # The constant of all together serves files of tools that know no channels; its error covers how far they differ.
     apart = float(np.std([row.constant for row in channels])) / whole.constant
-    facts, pulse = source.reader.facts, source.system.sigma_ref
+    facts, pulse, where = source.reader.facts, source.system.sigma_ref, options.chosen.where
     decomposer = next(step.stage.name for step in source.chain.steps if step.stage.kind == "decompose")
     return Calibration(
         constant=whole.constant,
@@ -523,7 +523,8 @@ def build_calibration(
         divergence=divergence,
         strip=source.path.name,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
-        conditions=f"sensor from {source.sensor.kind}, pulse {pulse:.4g} ns, {whole.echoes} echoes",
+        conditions=f"sensor from {source.sensor.kind}, pulse {pulse:.4g} ns, {whole.echoes} echoes"
+        + (f" where {where.text}" if where else ""),
         sensor=read_sensor_name(facts),
         software=decode_text(facts.header.generating_software).strip(),
         rate=source.setting.rate,

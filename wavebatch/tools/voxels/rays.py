@@ -423,7 +423,7 @@ def read_batches(
         known = known[count[at] < LONGEST_PULSE]
         kept = np.ones(len(owner), bool)
         if keep is not None:
-            kept = np.concatenate([_choose_packets(unit, keep)[some] for unit, some in tables])
+            kept = np.concatenate([unit.choose_packets(keep)[some] for unit, some in tables])
             here = here[np.isin(group[here], group[kept])]
         if choose is not None:
             here = here[np.isin(group[here], choose(np.unique(group[here])))]
@@ -440,15 +440,6 @@ def read_batches(
                 parts.append((unit, mine[some[inside] - shift], groups[inside], kept[some[inside]]))
             if len(some):
                 yield Batch(parts, known[np.isin(known["group"], groups)])
-
-
-def _choose_packets(unit: Unit, keep: PlannedFilter) -> np.ndarray:
-    """Whether a point of each packet of the unit is kept, bool (packets,)."""
-    chosen = np.zeros(len(unit.packets.owned) + 1, bool)
-    chosen[unit.packet_of_point[keep.test(unit.points, len(unit.points)) == 0]] = True
-    if len(unit.context):
-        chosen[unit.packet_of_context[keep.test(unit.context, len(unit.context)) == 0]] = True
-    return chosen[:-1]  # the last one is that of points without a packet, -1
 
 
 MOST_SECTION = 2.0**14
