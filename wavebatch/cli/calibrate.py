@@ -1,6 +1,6 @@
 """`wavebatch calibrate`: the calibration constant from targets of known reflectance.
 
-Only reads options and prints; the work is in `wavebatch.surveying.calibrating.targets`.
+Only reads options and prints; the work is in `wavebatch.surveying.calibrating.calibrate_flight`.
 """
 
 from __future__ import annotations

@@ -27,11 +27,11 @@ class ReceiverNoise:
     """What a receiver records without signal."""
 
     baseline: Annotated[float, Range(-1e10, 1e10), Key("baseline_dn", "level without signal", needed=True)] = 0.0
-    """Typical level without signal [count]."""
+    """Typical level without signal [DN]."""
     baseline_spread: Annotated[
         float, Range(0.0, 1e10), Key("baseline_spread_dn", "its standard deviation between waveforms", needed=True)
     ] = 0.0
-    """Standard deviation of the true baseline between waveforms [count]."""
+    """Standard deviation of the true baseline between waveforms [DN]."""
     recovery: Annotated[float, Range(0.0, 1e9), Key("recovery_ns", "after strong signal, until the level is back")] = (
         0.0
     )
@@ -39,11 +39,11 @@ class ReceiverNoise:
     std: Annotated[
         float, Range(1e-3, 1e10), Key("noise_std_dn", "noise of one sample, for thresholds and errors", needed=True)
     ] = QUANTISATION_STD
-    """Noise of one sample that thresholds and errors use [count]."""
+    """Noise of one sample that thresholds and errors use [DN]."""
     by_kind: Annotated[Mapping[str, Annotated[float, Range(0.0, 1e30)]], Key("noise_by_kind_dn", needed=True)] = field(
         default_factory=dict
     )
-    """The estimates that `std` was chosen from: quiet, outside of echoes, core ... [count]."""
+    """The estimates that `std` was chosen from: quiet, outside of echoes, core ... [DN]."""
     correlation: Annotated[
         tuple[Annotated[float, Range(-1.0, 1.0)], ...],
         Key("correlation", "of the noise of two samples 1, 2, ... spacings apart; empty: white noise", blank=True),
@@ -52,7 +52,7 @@ class ReceiverNoise:
     gain: Annotated[
         float, Range(0.0, 1e6), Key("noise_gain", "growth of the noise's variance per count of signal", needed=True)
     ] = 0.0
-    """Signal-dependent noise variance per count of signal [count] (docs/algorithms.md H12)."""
+    """Signal-dependent noise variance per count of signal [DN] (docs/algorithms.md H12)."""
     whitening: Annotated[
         tuple[Annotated[float, Range(-2.0, 2.0)], ...],
         Key(
@@ -63,7 +63,7 @@ class ReceiverNoise:
 
     @property
     def quiet(self) -> float:
-        """Noise of a quiet sample [count]: `std` is larger where noise is coloured."""
+        """Noise of a quiet sample [DN]: `std` is larger where noise is coloured."""
         return min(self.std, self.by_kind.get("quiet") or self.std)
 
 
@@ -75,11 +75,11 @@ class Defects:
         tuple[Annotated[float, Range(-1e6, 1e6)], ...],
         Key("pattern_dn", "offsets that repeat along the samples, taken off; empty: none", blank=True),
     ] = ()
-    """Offsets that repeat along the samples, of converters that take samples in turn [count]; empty for none."""
+    """Offsets that repeat along the samples, of converters that take samples in turn [DN]; empty for none."""
     slope_spread: Annotated[
         float, Range(0.0, 1e9), Key("slope_spread_dn_ns", "of baselines within a waveform, taken off")
     ] = 0.0
-    """Standard deviation of the slopes of baselines [count/ns]; 0 where baselines are level."""
+    """Standard deviation of the slopes of baselines [DN/ns]; 0 where baselines are level."""
     spikes: Annotated[float, Range(0.0, 1e6), Key("spikes", "of one sample, per waveform, taken off")] = 0.0
     """Spikes of one sample per waveform; 0 where they are not taken off."""
     transient: Annotated[float, Range(0.0, 1e9), Key("transient_ns", "at the start of waveforms, left out")] = 0.0

@@ -271,15 +271,15 @@ class Samples(NamedTuple):
     """n waveforms of s samples, with their noise."""
 
     counts: np.ndarray
-    """uint8, uint16, uint32 or float32 (n, s) [count]."""
+    """uint8, uint16, uint32 or float32 (n, s) [DN]."""
     baseline: np.ndarray
-    """Level of each waveform, float32 (n,), or of each sample (n, s) [count]."""
+    """Level of each waveform, float32 (n,), or of each sample (n, s) [DN]."""
     std: np.ndarray
-    """Noise of each waveform, float32 (n,) [count]."""
+    """Noise of each waveform, float32 (n,) [DN]."""
     missing: np.ndarray | None = None
     """Samples that were not recorded, bool (n, s); None where there is none."""
     level_err: np.ndarray | None = None
-    """Standard deviation of the error of each level, float32 (n,) [count]; None where they are not known."""
+    """Standard deviation of the error of each level, float32 (n,) [DN]; None where they are not known."""
 
     def checked(self, *, finite: bool = True) -> Samples:
         """The same as the library reads it; raises ValueError where it would read outside of the arrays.

@@ -30,7 +30,7 @@ NARROWEST = 1.2
 """Width of the system pulse [samples] from which a spike cannot be an echo, whose neighbours are seven tenths of it."""
 
 PATTERN, CERTAIN = 0.05, 6.0
-"""Offset of a pattern that matters [count, or noise of a sample], and its standard errors."""
+"""Offset of a pattern that matters [DN, or noise of a sample], and its standard errors."""
 
 SLOPES, STEEP = 0.02, 5.0
 """Share of the waveforms whose slope must exceed this many of its errors for slopes to be taken off ..."""
@@ -180,7 +180,7 @@ way."""
 def _slope_spread(
     signal: np.ndarray, std: float, colour: float, reach: int, missing: np.ndarray | None, recovery: int
 ) -> float:
-    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance or signal explains them.
+    """Standard deviation of the slopes of baselines [DN per sample]; 0 where chance or signal explains them.
 
     colour: errors of slopes over those in white noise.
     """

@@ -102,7 +102,7 @@ def unproven(system: SystemPulse, top: float = np.inf) -> Faintness | None:
     system : SystemPulse
         With the components of the learned pulse, what is known of it, and the misfit of its tail.
     top : float
-        Height above the baseline from which echoes are clipped [count].
+        Height above the baseline from which echoes are clipped [DN].
 
     Returns
     -------

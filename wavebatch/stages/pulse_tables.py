@@ -72,7 +72,7 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
     Returns
     -------
     float
-        Level [count].
+        Level [DN].
     """
     return float(block.digitizer.max_count) if system.saturation is None else system.saturation
 
@@ -93,7 +93,7 @@ def floor_level(system: SystemPulse) -> float:
     Returns
     -------
     float
-        Level [count].
+        Level [DN].
     """
     noise = system.noise
     return 0.0 if noise.baseline > FAR_FROM_FLOOR * np.hypot(noise.quiet, noise.baseline_spread) else -np.inf
@@ -345,7 +345,7 @@ def describe_fitted(
     limits : ShapeLimits
         Its widths.
     parameters, errors : float64 array, shape (m, 3)
-        Amplitude [count], time [samples] and width [samples], and their standard deviations.
+        Amplitude [DN], time [samples] and width [samples], and their standard deviations.
     shared : float64 array, shape (m, 2)
         Covariance of amplitude and width, and of time and width: peak and datum of the pulse change with its width.
 
@@ -401,7 +401,7 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
     limits : ShapeLimits
         Its widths.
     echoes : float64 array, shape (m, 3)
-        Amplitude [count], time [samples] and sigma [samples].
+        Amplitude [DN], time [samples] and sigma [samples].
 
     Returns
     -------

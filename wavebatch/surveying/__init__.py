@@ -5,8 +5,8 @@ How a strip is surveyed:
 1. In the folder `measuring`, `noise_and_width` fits the echoes that are alone in their waveform, and finds noise,
    baseline, pulse width and saturation from them, `learn_pulse` the pulse's shape; `residuals` finds the noise again
    from what fits leave, `misfit` what the pulse does not explain.
-2. `survey` runs these and decides which parts of a chain the scene needs. Its result is in `systems/survey_result`;
-   `systems/survey_result` saves it. `look` is the short survey by which strips are compared with a result.
+2. `survey` runs these and decides which parts of a chain the scene needs. Its result and the file
+   of it are in `systems/survey_result`. `look` is the short survey by which strips are compared with a result.
 3. `choose_chain` turns the decisions into a chain, and gives each strip its pulse and its chain; `predict_error` tries
    the shipped chains for `--tolerance`.
 4. `sensor` finds where the sensor was. With that and the beam's divergence, `flat_ground` measures how wide the echoes

@@ -1,8 +1,8 @@
 """The calibration of a sensor: its constants, what they were measured with, and the stages that it adds to a chain.
 
-`calibrating.targets` measures a calibration, `calibrating.calibration_files` keeps it as CAL.toml, and `wavebatch run`
-fits it to each strip with `matching.strip_match`. Before you change it: give new fields a default, since older files
-lack them.
+`calibrating.calibrate_flight` measures a calibration, `calibrating.calibration_files` keeps it as CAL.toml, and
+`wavebatch run` fits it to each strip with `matching.strip_match`. Before you change it: give new fields a default,
+since older files lack them.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class TargetResult:
     echoes: int
     """Clean single echoes on the target."""
     constant: float | None = None
-    """Median of the echoes' constants [1/(m2 count ns)]."""
+    """Median of the echoes' constants [1/(m2 DN ns)]."""
     spread: float | None = None
     """Robust standard deviation of the echoes' constants, relative."""
     incidence_deg: float | None = None
@@ -159,7 +159,7 @@ class Calibration:
         Range(1e-30, 1e30),
         Key("constant", "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"),
     ]
-    """C' [1/(m2 count ns)]."""
+    """C' [1/(m2 DN ns)]."""
     relative_error: Annotated[
         float, Range(0.0, 10.0), Key("relative_error", "standard deviation of the constant, relative")
     ]
@@ -246,7 +246,7 @@ class Calibration:
 
     @property
     def section_constant(self) -> float | None:
-        """C_cal [1/(m2 count ns)]; None where the divergence is unknown."""
+        """C_cal [1/(m2 DN ns)]; None where the divergence is unknown."""
         if self.divergence is None or math.isnan(self.constant):
             return None
         return 0.25 * math.pi * (1e-3 * self.divergence) ** 2 * self.constant

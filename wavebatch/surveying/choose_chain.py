@@ -1,6 +1,6 @@
 """The pulse and the chain of a strip: from its survey or a saved one, given by the user or chosen.
 
-`batch.unit` calls `make_choice` once per strip. Request says how to choose, Choice is the answer with its reasons.
+`prepare` calls `make_choice` once per strip. Request says how to choose, ChainChoice is the answer with its reasons.
 Before you change it: the choice must depend on the strip and the request alone, never on jobs or block size.
 
 The automatic chain is the cheapest one that serves a surveyed strip, with a comment on each part that is left out

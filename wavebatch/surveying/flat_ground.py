@@ -430,7 +430,7 @@ def predict_angles(
     divergence : float
         Full angle of the beam between the 1/e^2 points [mrad].
     amplitude : float
-        Of a typical echo [count].
+        Of a typical echo [DN].
     max_error : float
         Largest error of an angle that is written [deg].
 

@@ -1,7 +1,7 @@
 """One survey for all strips of a flight, and whether a strip belongs to it.
 
-`wavebatch survey STRIPS...` and `run --survey flight` call `survey_flight`; `batch.unit` compares every strip with
-the result (`hold_strip`). Before you change it: nothing may depend on the order in which the strips are given.
+`wavebatch survey STRIPS...` and `run --survey flight` call `survey_flight`; `prepare` compares every strip with the
+result (`hold_strip`). Before you change it: nothing may depend on the order in which the strips are given.
 """
 
 from __future__ import annotations

@@ -235,9 +235,9 @@ class Outgoing:
     reference: OutgoingReference
     shape: OutgoingShape | None
     energy: float
-    """Mean [count samples]."""
+    """Mean [DN samples]."""
     amplitude: float
-    """Mean [count]."""
+    """Mean [DN]."""
     scatter: float
     """Standard deviation of energies from shot to shot beyond their errors, relative."""
     error: float
@@ -257,13 +257,13 @@ class Plan:
     primary: int
     """The most sensitive channel: most segments are of it."""
     top: float
-    """Largest count of it where another channel recorded the same [count]."""
+    """Largest count of it where another channel recorded the same [DN]."""
     ratios: dict[int, float]
     """By other channel: gain of the primary one over its gain."""
     unknown: tuple[int, ...]
     """Other channels whose gain is not known: nothing tells that they see the same, so all of them is kept."""
     noise: float
-    """Of a sample of the primary channel [count]."""
+    """Of a sample of the primary channel [DN]."""
     digitizers: dict[int, Digitizer]
     """By code of segments."""
     outgoing: Outgoing | None
@@ -592,9 +592,9 @@ class Overlaps:
     """What pairs of segments of two channels say, summed up."""
 
     top: float = 0.0
-    """Largest count of the sensitive channel [count]."""
+    """Largest count of the sensitive channel [DN]."""
     products: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Heights of the sensitive and of the other channel at the same time [count]."""
+    """Heights of the sensitive and of the other channel at the same time [DN]."""
     pairs: int = 0
 
     def add(self, piece: PulsePiece, first: np.ndarray, second: np.ndarray) -> None:

@@ -87,7 +87,7 @@ class ScanLine:
     time: np.ndarray
     """Time after sample 0 [ns], f8 (m,)."""
     value: np.ndarray
-    """Sample above the level without signal [count], f4 (m,)."""
+    """Sample above the level without signal [DN], f4 (m,)."""
 
     def __len__(self) -> int:
         return len(self.point)
@@ -312,7 +312,7 @@ class Segment:
     rho: float
     """Normal form of the line in the slice [deg, pixels]."""
     weight: float
-    """Sum of intensities [count]."""
+    """Sum of intensities [DN]."""
 
 
 def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:

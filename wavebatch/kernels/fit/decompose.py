@@ -103,7 +103,7 @@ def explain_tails(
     candidates : Candidates
         m, sorted by waveform, then time.
     std : float32 (n,)
-        Noise of each waveform [count].
+        Noise of each waveform [DN].
     tail : PulseTail
         Of the system pulse.
     most : int
@@ -146,7 +146,7 @@ class Settings(NamedTuple):
     floor: float | None = None
     """Raw count up to which samples are cut off below; None where none is."""
     noise_gain: float = 0.0
-    """Noise variance per count of signal (docs/algorithms.md H12) [count]."""
+    """Noise variance per count of signal (docs/algorithms.md H12) [DN]."""
     tolerance: float = 1e-2
     """A fit has converged when the next step promises a fall of chi2 below this."""
     max_iterations: int = 40
@@ -195,7 +195,7 @@ class Solution(NamedTuple):
     """Root mean square residual within four widths of the pulse of each echo [noise standard deviations], of its window
     where it is alone there, float64 (m,)."""
     parameters: np.ndarray
-    """Amplitude [count], time [samples of the waveform], width [samples], skew of each echo, float64 (m, 4)."""
+    """Amplitude [DN], time [samples of the waveform], width [samples], skew of each echo, float64 (m, 4)."""
     errors: np.ndarray
     """One standard deviation of each parameter, float64 (m, 4)."""
     shared: np.ndarray
@@ -384,7 +384,7 @@ def describe_whole(
     ----------
     whole : WholePulse
     parameters, errors : float64 (m, 3)
-        Of its main component [count, samples, samples], and their standard deviations.
+        Of its main component [DN, samples, samples], and their standard deviations.
     shared : float64 (m, 2)
         Covariance of the width with the amplitude, and with the time.
 
@@ -423,7 +423,7 @@ def keep_echoes(
     factors : float64 (m, 4)
         On the errors of amplitude, time, sigma and energy.
     std : float32 (n,)
-        Noise of each waveform [count].
+        Noise of each waveform [DN].
     spacing : float
         Time between two samples [ns].
     length : int
@@ -431,7 +431,7 @@ def keep_echoes(
     significance : float
         Least energy of an echo [standard deviations].
     level_err : float32 (n,), optional
-        Standard deviations of the levels that fits left free [count]; None where they took them as known.
+        Standard deviations of the levels that fits left free [DN]; None where they took them as known.
 
     Returns
     -------

@@ -31,11 +31,11 @@ class Sums(NamedTuple):
     first: np.ndarray
     """First echo of each waveform and the number of echoes, int64 (n + 1,)."""
     main: np.ndarray
-    """Amplitude, time and width of the pulse's main component [count, samples], float64 (m, 3)."""
+    """Amplitude, time and width of the pulse's main component [DN, samples], float64 (m, 3)."""
     left: np.ndarray
-    """Samples less level and echoes, float32 (n, s) [count]."""
+    """Samples less level and echoes, float32 (n, s) [DN]."""
     model: np.ndarray
-    """The echoes, float32 (n, s) [count]."""
+    """The echoes, float32 (n, s) [DN]."""
     used: np.ndarray
     """Samples that count, bool (n, s)."""
 
@@ -44,15 +44,15 @@ class SampleNoise(NamedTuple):
     """Noise of a sample."""
 
     std: float
-    """[count]."""
+    """[DN]."""
     gain: float = 0.0
-    """Growth of the variance per count of signal [count]."""
+    """Growth of the variance per count of signal [DN]."""
     correlation: tuple[float, ...] = ()
     """Of two samples 1, 2, ... apart; the first two count."""
 
 
 def render_pulses(shape: PulseShape, n: int, s: int, waveform: np.ndarray, main: np.ndarray) -> np.ndarray:
-    """Return the sum of the pulses of each waveform, float32 (n, s) [count].
+    """Return the sum of the pulses of each waveform, float32 (n, s) [DN].
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def render_pulses(shape: PulseShape, n: int, s: int, waveform: np.ndarray, main:
     waveform : int (m,)
         Row of each echo, ascending.
     main : float64 (m, 3)
-        Amplitude, time and width of the pulse's main component [count, samples].
+        Amplitude, time and width of the pulse's main component [DN, samples].
     """
     if (waveform[1:] < waveform[:-1]).any():
         raise ValueError("echoes are not sorted by their waveform")

@@ -32,7 +32,7 @@ class Faintness(NamedTuple):
     after: bool = False
     """Or so far after them."""
     top: float = np.inf
-    """Below `clipped` of one from this amplitude on, wherever it is [count]."""
+    """Below `clipped` of one from this amplitude on, wherever it is [DN]."""
     clipped: float = 0.0
     tail: Points = ()
     """What a stronger echo leaves unexplained by how much later they are, as a share of its amplitude."""
@@ -54,7 +54,7 @@ class Unexplained(NamedTuple):
     """An echo leaves `misfit` of its amplitude up to here."""
     misfit: float
     clear: float
-    """From this amplitude on [count] one leaves `left` up to `beside` away, by how much later the other is."""
+    """From this amplitude on [DN] one leaves `left` up to `beside` away, by how much later the other is."""
     beside: float
     energy: float
     """What an echo of amplitude 1 leaves counts so much, in the variance of the other."""
@@ -82,7 +82,7 @@ class Flagging(NamedTuple):
     narrow: float
     """And below this."""
     level: float
-    """SATURATED: a sample within `reach` widths is at least this [count]."""
+    """SATURATED: a sample within `reach` widths is at least this [DN]."""
     reach: float
     unreliable: float
     """AMPLITUDE_UNRELIABLE: this share of the amplitude is above the level."""

@@ -117,7 +117,7 @@ def render_skewed(
     waveform : int (m,)
         Row of each echo.
     time, amplitude, width, skew : float (m,)
-        Peak [samples], amplitude [count], width [samples] and skew of each echo.
+        Peak [samples], amplitude [DN], width [samples] and skew of each echo.
 
     Returns
     -------

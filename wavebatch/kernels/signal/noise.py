@@ -97,14 +97,14 @@ DITHER = np.array([0.75487767, 0.56984029], np.float32)
 """Steps along samples and waveforms, modulo 1, that fill the unit interval evenly: powers of the plastic number."""
 
 ROUNDED, ENOUGH = 0.5, 500
-"""Noise [count] below which rounding makes it lopsided, and quiet samples from which it is known not to be."""
+"""Noise [DN] below which rounding makes it lopsided, and quiet samples from which it is known not to be."""
 
 LEAST_SHARE = 0.25
 """Pairs at a lag, over those of neighbours, from which it counts: the few longest runs are not like the others."""
 
 
 class PooledNoise(NamedTuple):
-    """Noise of one recorded sample over many waveforms [count]."""
+    """Noise of one recorded sample over many waveforms [DN]."""
 
     level: float
     """Mean of the quiet samples."""
@@ -128,7 +128,7 @@ def estimate_noise(
     Parameters
     ----------
     signal : float32 (s, n)
-        Raw counts, one waveform per column [count].
+        Raw counts, one waveform per column [DN].
     reach : int
         Samples next to a signal that are not quiet.
     limit : float
@@ -500,7 +500,7 @@ def _spread_of_levels(level: np.ndarray, number: np.ndarray, covariance: np.ndar
 
 
 RECOVERED = 0.1
-"""Difference of a baseline from the level before the signal that does not matter [count, or noise of a sample]."""
+"""Difference of a baseline from the level before the signal that does not matter [DN, or noise of a sample]."""
 
 LEAST_BEFORE = 4
 """Quiet samples before its first signal from which a waveform shows the level without a tail ..."""

@@ -37,13 +37,13 @@ class OutgoingReference(NamedTuple):
     width: float
     """Gaussian standard deviation [samples]."""
     noise: float
-    """Standard deviation of a sample [count]."""
+    """Standard deviation of a sample [DN]."""
     gain: float
     """Variance of a mean of samples over that of white noise, for correlated noise."""
     level: float
-    """Mean level without light [count]."""
+    """Mean level without light [DN]."""
     spread: float
-    """Standard deviation of true levels between shots [count]."""
+    """Standard deviation of true levels between shots [DN]."""
     top: float = np.inf
     """Count at which recordings are clipped."""
 
@@ -52,13 +52,13 @@ class OutgoingPulses(NamedTuple):
     """Measures of n outgoing pulses; NaN where a recording shows none, or all but the time where it is clipped."""
 
     energy: np.ndarray
-    """Sum above the level, f8 (n,) [count samples]."""
+    """Sum above the level, f8 (n,) [DN samples]."""
     amplitude: np.ndarray
-    """Height of the peak above the level, f8 (n,) [count]."""
+    """Height of the peak above the level, f8 (n,) [DN]."""
     time: np.ndarray
     """Place of the peak, f8 (n,) [samples]."""
     level: np.ndarray
-    """f8 (n,) [count]."""
+    """f8 (n,) [DN]."""
     energy_error: np.ndarray
     """Standard deviation, f8 (n,)."""
     amplitude_error: np.ndarray

@@ -77,7 +77,7 @@ def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     Returns
     -------
     float64 array, shape (m,)
-        [count ns]. Of an echo of a surface that faces the sensor it is amplitude times sigma, whatever the pulse.
+        [DN ns]. Of an echo of a surface that faces the sensor it is amplitude times sigma, whatever the pulse.
 
     Notes
     -----
@@ -219,7 +219,7 @@ def normalize_amplitude(
     Returns
     -------
     value, relative : float64 array, shape (m,)
-        Amplitudes [count] and their relative errors.
+        Amplitudes [DN] and their relative errors.
     cases : Cases
         Why values may be missing.
     """

@@ -329,7 +329,7 @@ def rebuild_waveforms(
     Returns
     -------
     float32 array, shape (n, s), or None
-        Signal above the baseline [count]; None for decomposers without a pulse model.
+        Signal above the baseline [DN]; None for decomposers without a pulse model.
     """
     shape = fitted_pulse(decomposer, system, block.spacing)
     return None if shape is None else render_table(shape, block, system, echoes)
@@ -352,7 +352,7 @@ def render_table(shape: PulseShape, block: WaveformBlock, system: SystemPulse, e
     Returns
     -------
     float32 array, shape (n, s)
-        Signal above the baseline [count].
+        Signal above the baseline [DN].
     """
     amplitude, time, width = _parameters(shape, system, block.spacing, echoes)
     n, s = block.samples.shape
@@ -387,7 +387,7 @@ def echo_pulses(
     Returns
     -------
     callable
-        From times [ns], shape (q,), to the pulse of each echo [count], float64 (k, q).
+        From times [ns], shape (q,), to the pulse of each echo [DN], float64 (k, q).
     """
     amplitude, time, width = (values[:, None] for values in _parameters(shape, system, spacing, echoes))
 

@@ -63,7 +63,7 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
     Returns
     -------
     float32 array, shape (s, n)
-        Signal above the baseline [count]; waveforms lie along the last axis, as kernels need it.
+        Signal above the baseline [DN]; waveforms lie along the last axis, as kernels need it.
     """
     signal = transpose_samples(block.samples)
     signal -= noise.level.T
@@ -115,7 +115,7 @@ def make_table(
     time, width : float array, shape (m,)
         Centre and standard deviation [samples].
     amplitude : float array, shape (m,)
-        Height above the baseline [count].
+        Height above the baseline [DN].
     varies : bool
         Whether constant waveforms have none already.
 
@@ -161,7 +161,7 @@ def candidate_table(
     time : float array, shape (m,)
         Centre [samples].
     amplitude : float array, shape (m,)
-        Height above the baseline [count].
+        Height above the baseline [DN].
     width : float array, shape (m,), optional
         Standard deviation [samples]; the system's by default.
 

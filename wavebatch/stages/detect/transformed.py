@@ -85,7 +85,7 @@ def transform(signal: np.ndarray, ref: float, wavelet: str, scale: float, spacin
     Parameters
     ----------
     signal : float array, shape (s, n)
-        Waveforms above their baselines [count].
+        Waveforms above their baselines [DN].
     ref : float
         Width of the system pulse [samples].
     wavelet : {"b3", "mexican_hat"}

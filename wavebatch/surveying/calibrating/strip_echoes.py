@@ -1,7 +1,7 @@
 """Clean single echoes of a strip, decomposed as `wavebatch run` does, with their energy, range and channel.
 
-`targets` opens each strip with `open_source` and reads echoes on targets and on tie cells. Pulse, chain and energy are
-those of a run: the same choice, and the stage that `backscatter_coefficient` comes from with a constant of 1.
+`calibrate_flight` opens each strip with `open_source` and reads echoes on targets and on tie cells. Pulse, chain and
+energy are those of a run: the same choice, and the stage of `backscatter_coefficient` with a constant of 1.
 """
 
 from __future__ import annotations

@@ -205,7 +205,7 @@ def measure_target(
     used : array of ECHO (k,)
         Echoes on the target's plane, with their whole footprint inside.
     constant : float64 (k,)
-        The constant of each [1/(m2 count ns)].
+        The constant of each [1/(m2 DN ns)].
 
     Notes
     -----

@@ -1,7 +1,7 @@
 """What a strip says of its sensor and its setting: day, name, channels, rate of pulses, light of the strongest echoes.
 
-`targets` measures it for CAL.toml and `strip_match` for each strip: another pulse rate or gain under the same header
-makes another sensor of it.
+`strip_echoes` measures it for CAL.toml and `strip_match` for each strip: another pulse rate or gain under the same
+header makes another sensor of it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The energies of a strip's pulses beside those of its calibration, and what the strip's own light says of both.
 
-`run`, `calibrate` and `voxelize` call `take_energies` once per strip. What a strip lacks against its calibration goes
-into the errors: the scatter of energies that are not logged, a log that drifts alone, two lasers without a mark.
+`prepare` and `strip_echoes` call `take_energies` once per strip. What a strip lacks against its calibration goes into
+the errors: the scatter of energies that are not logged, a log that drifts alone, two lasers without a mark.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Whether a calibration fits the strip that it is used for: channel, recording, pulse, chain, day, distance.
 
-`batch.unit` and `tools.voxels` call `match_strip` once per strip. A constant belongs to one channel of one sensor with
+`prepare` calls `match_strip` once per strip. A constant belongs to one channel of one sensor with
 its settings: for anything else it is wrong by any factor. A contradiction is an error, with the reason; what only makes
 the constant less certain (day, distance, air, software, rate of the pulses, noise, light and divergence) gives a
 warning and a larger error.

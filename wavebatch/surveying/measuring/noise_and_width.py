@@ -178,7 +178,7 @@ def measure_once_more(block: WaveformBlock, system: SystemPulse) -> ReceiverNois
 
 
 def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> SystemPulse:
-    """The system with a growth of its noise [count], and the width that echoes repeat by errors that hold it.
+    """The system with a growth of its noise [DN], and the width that echoes repeat by errors that hold it.
 
     By those of white noise the narrowest of scattered widths are taken for it: a fifth too narrow at a growth of 0.2.
     """

@@ -118,7 +118,7 @@ def subtract_echoes(
     Returns
     -------
     float32 (n, s)
-        Samples above the baseline less the echoes [count]; NaN where a sample was not recorded, 0 where it is clipped
+        Samples above the baseline less the echoes [DN]; NaN where a sample was not recorded, 0 where it is clipped
         and the echoes are higher, or cut off below and they are lower: it shows no more than that they are.
     """
     noise = pooled_noise(block, system)

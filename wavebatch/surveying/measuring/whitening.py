@@ -27,7 +27,7 @@ from wavebatch.surveying.measuring.noise_and_width import DITHERED, FEW, UNDITHE
 from wavebatch.surveying.measuring.residuals import find_echoes
 
 LEAST_NOISE = 0.5
-"""Noise of a sample below which rounding makes what a filter of neighbours sees [count]."""
+"""Noise of a sample below which rounding makes what a filter of neighbours sees [DN]."""
 
 LEAST_PREDICTED = 0.1
 """Share of the noise's variance that two samples must predict of the next one: below it, the errors of close echoes

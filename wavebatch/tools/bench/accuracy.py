@@ -142,7 +142,7 @@ def smoothed_power(color: np.ndarray | int) -> np.ndarray | float:
 
 
 def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
-    """Cramer-Rao bounds of time [ns], amplitude [count] and sigma [ns] of every true echo, (m, 3).
+    """Cramer-Rao bounds of time [ns], amplitude [DN] and sigma [ns] of every true echo, (m, 3).
 
     All echoes of a waveform are estimated together, the baseline is known; clipped samples have no weight, noise grows
     with the signal. truth: as tools.simulate gives it; the bounds are those of the widths of `make_groups`, infinite

@@ -203,7 +203,7 @@ def shape_pulse(
 def spread_lobes(
     pulse: PulseModel, time: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Lobes of echoes, the main lobe first: (time [ns], height [count], sigma [ns]) of each, (m,).
+    """Lobes of echoes, the main lobe first: (time [ns], height [DN], sigma [ns]) of each, (m,).
 
     time, amplitude, sigma: (m,) as in the truth table. Heights are scaled so that all lobes together peak at
     `amplitude`.
@@ -284,7 +284,7 @@ class Recording:
     bits: Literal[8, 16, 32] = option(8, "Bits per sample.", unset="8")
     baseline: float = option(12.0, "Level without signal [DN].", form="DN", unset="12")
     baseline_spread: float = 0.4
-    """Standard deviation of the level between waveforms [count]."""
+    """Standard deviation of the level between waveforms [DN]."""
     noise_std: Annotated[float, Range(0.0, MOST_NOISE)] = option(
         1.0, "Standard deviation of the noise before rounding [DN].", form="DN", name="noise",
         unset="the scene's, 1 or 1.2",
@@ -327,12 +327,12 @@ class Recording:
 
     @property
     def recorded_noise(self) -> float:
-        """Standard deviation of one recorded sample without signal [count]: noise and rounding."""
+        """Standard deviation of one recorded sample without signal [DN]: noise and rounding."""
         return float(np.hypot(self.noise_std, QUANTISATION_STD))
 
     @property
     def empty_level(self) -> float:
-        """Mean of the recorded samples without signal [count]: clipping and rounding may move it off the baseline."""
+        """Mean of the recorded samples without signal [DN]: clipping and rounding may move it off the baseline."""
         spread = float(np.hypot(self.noise_std, self.baseline_spread))
         place = np.linspace(-8.0, 8.0, 16_000)  # an even number: a baseline on a whole count has no ties
         counts = np.clip(np.floor(self.baseline + 0.5 + spread * place), 0, self.clip)
@@ -352,9 +352,9 @@ class Recording:
 def paint_echoes(
     recording: Recording, n: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray
 ) -> np.ndarray:
-    """Signal without baseline and noise, float32 (n, s) [count].
+    """Signal without baseline and noise, float32 (n, s) [DN].
 
-    waveform (m,) must be sorted; time [ns], amplitude [count] and sigma [ns] per echo, (m,).
+    waveform (m,) must be sorted; time [ns], amplitude [DN] and sigma [ns] per echo, (m,).
     """
     first = np.searchsorted(waveform, np.arange(n))
     rank = np.arange(len(waveform)) - first[waveform]
@@ -399,7 +399,7 @@ def paint_echoes(
 def record_counts(
     recording: Recording, signal: np.ndarray, rng: np.random.Generator, constant: np.ndarray | None = None
 ) -> np.ndarray:
-    """Raw counts, unsigned (n, s): baseline plus signal [count] plus noise, clipped and rounded.
+    """Raw counts, unsigned (n, s): baseline plus signal [DN] plus noise, clipped and rounded.
 
     constant: level of the waveforms whose samples are all equal, NaN for the others, (n,).
     """

@@ -281,7 +281,7 @@ class Returns:
     time: np.ndarray
     """True time after sample 0 [ns], f8 (k,)."""
     amplitude: np.ndarray
-    """[count], (k,); 0 for the stand-in return of a pulse without echo."""
+    """[DN], (k,); 0 for the stand-in return of a pulse without echo."""
     number: np.ndarray
     """Return number from 1, i8 (k,)."""
     total: np.ndarray
@@ -318,7 +318,7 @@ class DiscreteReceiver(CheckedOptions):
 
         Parameters
         ----------
-        pulse, distance, amplitude : echoes (m,), sorted by pulse, then distance [m]; amplitude [count]
+        pulse, distance, amplitude : echoes (m,), sorted by pulse, then distance [m]; amplitude [DN]
 
         Returns
         -------

@@ -50,7 +50,7 @@ class Canopy:
     cover: float
     """Share of the pulses that meet plants; the others see the ground only."""
     full: float = 200.0
-    """Amplitude of the echo that takes a whole pulse [count]."""
+    """Amplitude of the echo that takes a whole pulse [DN]."""
 
     @property
     def duration(self) -> float:
@@ -100,13 +100,13 @@ class Drawn:
     time: np.ndarray
     """Peak after sample 0 [ns], f8 (m,)."""
     amplitude: np.ndarray
-    """[count], f8 (m,)."""
+    """[DN], f8 (m,)."""
     sigma: np.ndarray
     """Of the main lobe [ns], f8 (m,)."""
     ghost: np.ndarray | None = None
     """True for lobes that are no echo (ringing); None when all are echoes."""
     constant: np.ndarray | None = None
-    """Level of waveforms whose samples are all equal [count], NaN for the others, (n,); None when there is none."""
+    """Level of waveforms whose samples are all equal [DN], NaN for the others, (n,); None when there is none."""
 
 
 def tabulate_echoes(time: np.ndarray, amplitude, sigma, ghost: np.ndarray | None = None) -> Drawn:
@@ -121,7 +121,7 @@ def tabulate_echoes(time: np.ndarray, amplitude, sigma, ghost: np.ndarray | None
 
 @frozen
 class LogUniform:
-    """Amplitudes between low and high [count], evenly spread over their logarithm."""
+    """Amplitudes between low and high [DN], evenly spread over their logarithm."""
 
     low: float
     high: float
@@ -132,7 +132,7 @@ class LogUniform:
 
 @frozen
 class LogNormal:
-    """Amplitudes around a median [count], cut at low and high."""
+    """Amplitudes around a median [DN], cut at low and high."""
 
     median: float
     spread: float
@@ -357,7 +357,7 @@ class Scene:
     divergence: float = 0.0
     """Full angle of the beam between the 1/e^2 points [mrad]; above 0, slopes widen the echoes."""
     light: float = 0.0
-    """amplitude sigma range^2 of a white surface that faces the sensor, without attenuation by the air [count ns m2].
+    """amplitude sigma range^2 of a white surface that faces the sensor, without attenuation by the air [DN ns m2].
     Above 0, amplitudes are those of Lambertian surfaces with GROUND_REFLECTS and ROOFS_REFLECT."""
     flight: FlightLine | None = None
     """None: the default Flight."""
@@ -554,7 +554,7 @@ def simulate_block(
 
     scene: a Scene or the name of one. recording: replaces the scene's receiver.
     In the truth, time is the datum of the pulse [ns after sample 0], amplitude the height of the peak above the
-    baseline [count] and sigma the standard deviation of the main lobe [ns]; the flags are those of `flag_truth`. The
+    baseline [DN] and sigma the standard deviation of the main lobe [ns]; the flags are those of `flag_truth`. The
     block's origin is the true position of sample 0. Raises ConfigError for an unknown scene.
     """
     scene = find_scene(scene)

@@ -53,7 +53,7 @@ ECHO_COLUMNS: dict[str, str] = {
     "overlapped": "|b1",
 }
 """Per true echo, in file order: packet number, byte offset of its packet, GPS time of its pulse [s], time after
-sample 0 [ns], amplitude [count], sigma [ns], position [m], angle to the ground's normal [deg], sensor to echo [m],
+sample 0 [ns], amplitude [DN], sigma [ns], position [m], angle to the ground's normal [deg], sensor to echo [m],
 EchoFlag bits, whether it is isolated, whether a neighbour overlaps it."""
 
 PACKET_COLUMNS: dict[str, str] = {"packet_byte_offset": "<u8", "packet_gps_time": "<f8"}

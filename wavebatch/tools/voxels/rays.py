@@ -110,7 +110,7 @@ class Profiles:
     """Signal of n waveforms along their rays."""
 
     value: np.ndarray
-    """Heights of system pulses, one at every sample, whose sum is the waveform, f8 (n, s) [count]; 0: no signal."""
+    """Heights of system pulses, one at every sample, whose sum is the waveform, f8 (n, s) [DN]; 0: no signal."""
     area: float
     """Integral of a system pulse of height 1 [ns]."""
     seen: np.ndarray
