@@ -99,6 +99,8 @@ class RunReport:
     """Echoes that reflect more than a white matt surface, level or facing the sensor."""
     last_left_out: int = 0
     """Points of left_out["where"] that are the last echo of their pulse."""
+    copied_echoes: int = 0
+    """Echoes that do not count, because another packet of their pulse has them too."""
     remarks: tuple[str, ...] = ()
     """Lines about the strip as a whole, from `report_file`."""
     warnings: tuple[StripWarning, ...] = ()
@@ -198,6 +200,7 @@ class RunReport:
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
                 "reflectance_above_one": self.above_one,
                 "last_echoes_left_out": self.last_left_out,
+                "copied_echoes": self.copied_echoes,
                 **histograms,
             },
         }
@@ -224,6 +227,7 @@ class RunReport:
             warnings=tuple(StripWarning(str(one["code"]), str(one["text"])) for one in document["warnings"]),
             above_one=int(quality.get("reflectance_above_one", 0)),
             last_left_out=int(quality.get("last_echoes_left_out", 0)),
+            copied_echoes=int(quality.get("copied_echoes", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=histograms["amplitude_dn"],
             echo_width=histograms["echo_width_ns"],

@@ -22,7 +22,14 @@ from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_whole_records, widen_integers
 from wavebatch.files.las.header import locate, read_scanner, split_numbers
-from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, find_rays, group_times, number_returns
+from wavebatch.kernels.geometry.group_returns import (
+    along_ray,
+    find_nearest,
+    find_pulses,
+    find_rays,
+    group_times,
+    number_returns,
+)
 
 if TYPE_CHECKING:
     from wavebatch.files.cloud.writer import OutputLayout
@@ -48,6 +55,8 @@ class UnitEchoes:
     """Whether a packet of the unit was read, bool (packets,)."""
     direction: np.ndarray
     """Away from the sensor, per packet [m/ns], f8 (packets, 3)."""
+    origin: np.ndarray
+    """Position of the first sample of each packet from the raw return location [m], f8 (packets, 3)."""
 
 
 @frozen(eq=False)
@@ -113,11 +122,11 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     """
     n = len(unit.packets.owned)
     times_read = np.zeros(n, np.int64)
-    direction = np.zeros((n, 3))
+    direction, origin = np.zeros((n, 3)), np.zeros((n, 3))
     tables, nearest = [], [np.empty(0, np.int64)]
     for block, index, table in results:
         times_read += np.bincount(index, minlength=n)
-        direction[index] = block.direction
+        direction[index], origin[index] = block.direction, block.origin
         near = table.attributes["point"].astype(np.int64)
         free = np.flatnonzero(near < 0)
         returns = block.returns
@@ -138,7 +147,7 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     if np.any(np.diff(table.waveform) < 0):  # blocks of several digitizers or lengths
         order = np.argsort(table.waveform, kind="stable")
         table, near = table.take(order), near[order]
-    return UnitEchoes(table, near, times_read > 0, direction)
+    return UnitEchoes(table, near, times_read > 0, direction, origin)
 
 
 def assemble_echoes(
@@ -186,6 +195,9 @@ def assemble_echoes(
         raise _bug(unit, "an echo lies in a packet of another unit")
     point = echoes.table.attributes["point"]
     table = echoes.table.with_flags(EchoFlag.ADDED, point < 0)
+    pulse = _find_pulses(unit, echoes, layout.source.header)
+    counted = ~_find_copies(unit, echoes, pulse)
+    written = np.flatnonzero(counted)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
     # Passed through: points without a usable packet, and points of owned packets that no echo matches.
@@ -195,17 +207,17 @@ def assemble_echoes(
     no_echo = np.full(len(silent), EchoFlag.NO_ECHO, np.uint16)
     # Rows are sorted by the first point of their packet, or by their point where they have no packet.
     owner = np.append(unit.packets.owner - unit.start, -1)
-    owner = owner[np.concatenate([table.waveform, members.packet[passed]])]
-    source = np.concatenate([members.find(echoes.nearest), passed])
+    owner = owner[np.concatenate([table.waveform[written], members.packet[passed]])]
+    source = np.concatenate([members.find(echoes.nearest[written]), passed])
     owner = np.where(owner < 0, source, owner)
     # Points that share a packet are sorted by their return locations; NaN comes first.
     located = widen_integers(members.source["return_point_wave_location"][passed]) / PS_PER_NS
-    order: Any = find_order(owner, np.concatenate([table.time, np.nan_to_num(located, nan=-np.inf)]))
+    order: Any = find_order(owner, np.concatenate([table.time[written], np.nan_to_num(located, nan=-np.inf)]))
     order = slice(None) if order is None else order
     # Rows in the order of the output: their echo or -1, their point, the point that owns their packet, and their flags.
-    echo = np.concatenate([np.arange(len(table)), np.full(len(passed), -1)])[order]
+    echo = np.concatenate([written, np.full(len(passed), -1)])[order]
     source, owner = source[order], owner[order]
-    reason = np.concatenate([np.zeros(len(table), np.uint16), unit.point_flags[missing], no_echo])[order]
+    reason = np.concatenate([np.zeros(len(written), np.uint16), unit.point_flags[missing], no_echo])[order]
     records = take_whole_records(members.source, source)
     xyz = np.stack([np.append(table.attributes[name], np.nan)[echo] for name in "xyz"], axis=1)
     packet = np.where(echo >= 0, np.append(table.waveform, -1)[echo], members.packet[source])
@@ -214,12 +226,11 @@ def assemble_echoes(
     # For all rows at once: to take those that are passed through takes longer than to locate the others too.
     places = np.where(absent, locate(records, layout.source.header), xyz) if absent.any() else xyz
     flags = np.append(table.flags, np.uint16(0))[echo] | reason
-    pulse = _find_pulses(unit, echoes, layout.source.header)[owner]
     # Pulses without any waveform, rows that are not written, and points that are stored twice keep the input's numbers.
     number, total = (given.astype(np.int64) for given in split_numbers(records))
     kept = ((flags & np.uint16(dropped)) == 0) & ~((echo < 0) & _find_repeated(members, silent, found)[source])
     at: Any = slice(None) if kept.all() else np.flatnonzero(kept)
-    numbers, count, known = number_returns(pulse[at], places[at], direction[at])
+    numbers, count, known = number_returns(pulse[owner][at], places[at], direction[at])
     number[at] = np.where(known, numbers, number[at])
     total[at] = np.where(known, count, total[at])
     flags |= np.where(number > layout.max_return, np.uint16(EchoFlag.RETURN_LIMIT), np.uint16(0))
@@ -234,9 +245,8 @@ def assemble_echoes(
         matched=(echo < 0) | np.append(point >= 0, False)[echo],
         time=np.append(table.time, np.nan)[echo],
     )
-    counted = np.ones(len(table), bool)
     report = _count(unit, table, counted, members.packet, found, owned[members.packet], reason)
-    return Assembled(output, echo, columns, counted, report)
+    return Assembled(output, echo, columns, counted, replace(report, copied_echoes=len(table) - len(written)))
 
 
 def assemble_returns(
@@ -281,8 +291,10 @@ def assemble_returns(
     packet = unit.packet_of_point
     # An echo counts in the unit of its point, where the second pass has seen it; without one in that of its packet.
     counted = unit.packets.owned[table.waveform] & (table.attributes["point"] < 0)
-    counted[mine] = True
+    copied = counted & _find_copies(unit, echoes, _find_pulses(unit, echoes, layout.source.header))
+    counted[copied], counted[mine] = False, True
     report = _count(unit, table, counted, packet, found, packet >= 0, np.where(found, np.uint16(0), reason))
+    report = replace(report, copied_echoes=int(copied.sum()))
     return Assembled(output, echo, columns, counted, report)
 
 
@@ -330,6 +342,41 @@ def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarra
     step = echoes.direction[np.where(packet[lead] >= 0, packet[lead], known[pulse[lead]])]
     pulse[lead] = lead[find_rays(pulse[lead], scanner, locate(points, header), step)]
     return pulse
+
+
+def _find_copies(unit: Unit, echoes: UnitEchoes, pulse: np.ndarray) -> np.ndarray:
+    """Which echoes without a return another packet of their pulse and digitizer shows too, bool (k,).
+
+    Packets of a pulse may overlap, and some files have one for each return: each of them shows the same echoes, of
+    which that of a return counts, or that of the first packet. No decomposer parts echoes within a pulse's width.
+    """
+    table, packets = echoes.table, unit.packets
+    copied, key = np.zeros(len(table), bool), np.full(len(packets), -1)
+    rows = np.flatnonzero(packets.owned)
+    key[rows] = pulse[packets.owner[rows] - unit.start]
+    rows = rows[np.bincount(key[rows], minlength=len(pulse))[key[rows]] > 1]
+    if not len(rows):
+        return copied
+    key = key * 256 + packets.digitizer
+    first, group = np.unique(key[rows], return_index=True, return_inverse=True)[1:]
+    head, shift = rows[first][group], np.full(len(packets), np.nan)
+    shift[rows] = along_ray(echoes.origin[rows], echoes.origin[head], echoes.direction[head])
+    time = table.time + shift[table.waveform]
+    at = np.flatnonzero(np.isfinite(time))
+    at = at[np.lexsort((table.waveform[at], time[at], key[table.waveform[at]]))]
+    added, behind = table.attributes["point"] < 0, 1
+    while behind < len(at):
+        one, other = at[:-behind], at[behind:]
+        near = key[table.waveform[one]] == key[table.waveform[other]]
+        near &= time[other] - time[one] <= np.minimum(table.sigma[one], table.sigma[other])
+        if not near.any():
+            break
+        near &= table.waveform[one] != table.waveform[other]
+        late = table.waveform[one] > table.waveform[other]
+        copied[one[near & added[one] & (late | ~added[other])]] = True
+        copied[other[near & added[other] & ~(late & added[one])]] = True
+        behind += 1
+    return copied
 
 
 def _columns(

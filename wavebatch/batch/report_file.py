@@ -394,6 +394,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...]
     if last:
         lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
                      "the ground: return numbers stay those of the whole pulse")  # fmt: skip
+    if report.copied_echoes:
+        lines.append(f"packets of a pulse overlap: {report.copied_echoes} echoes that another of them has do not count")
     layout, added = prepared.layout, report.flags.get("ADDED", 0)  # those that are written
     lines += [*layout.notes, *describe_roundings(layout.written)]
     if added and layout.copied:

@@ -90,18 +90,15 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
     found = {name: _measure(residuals) for name, residuals in kinds.items()}
     known = {name: HALF_C * scatter for name, scatter in found.items() if scatter is not None}
     source = min(known, key=known.__getitem__, default="assumed")
-    rounding, scatter = _measure_rounding(reader, scan), known.get(source, RETURNS)
-    if rounding > max(scatter, LEAST_ROUNDING):
-        return ReturnScatter(rounding, phase, "rounding")
-    return ReturnScatter(scatter, phase, source)
-
-
-def _measure_rounding(reader: StripReader, scan: StripScan) -> float:
-    """Standard deviation of what rounding takes off the coarsest coordinate: locations do not show it [m]."""
+    # What rounding takes off the coarsest coordinate: locations do not show it.
     points = reader.read_points(0, int(min(scan.borders[-1], ROUNDED)), scan)
     values = [distinct(points[name].astype(np.int64)) for name in "XYZ"]
     steps = [np.gcd.reduce(np.diff(one)) if len(one) >= FEWEST_VALUES else 0 for one in values]
-    return float(np.max(np.multiply(steps, reader.facts.header.scales))) / 12.0**0.5
+    rounding = float(np.max(np.multiply(steps, reader.facts.header.scales))) / 12.0**0.5
+    scatter = known.get(source, RETURNS)
+    if rounding > max(scatter, LEAST_ROUNDING):
+        return ReturnScatter(rounding, phase, "rounding")
+    return ReturnScatter(scatter, phase, source)
 
 
 def _measure(residuals: np.ndarray) -> float | None:
