@@ -114,7 +114,7 @@ def test_stages_after_it_see_its_columns_whatever_the_units(strips, clouds, tmp_
     after = Stage("attribute.energy", "attribute", energy, {}, ("energy",), (COLUMNS[0],))
     chain = parse_chain(CHAIN, "test")
     chain = replace(chain, steps=(*chain.steps, Step(after)))
-    known = {"chosen": PointFilter.build(where="energy < 40 and z > 0"), "unit_points": 3000}
+    known = {"selection": PointFilter.build(where="energy < 40 and z > 0"), "unit_points": 3000}
     report = run_strip(strips / "slope.las", tmp_path, chain=chain, known=known, points=points)
     cloud = laspy.read(tmp_path / "slope.laz")
     angle = np.asarray(cloud[COLUMNS[0]])

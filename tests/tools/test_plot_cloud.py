@@ -431,7 +431,7 @@ def test_unreadable_values_do_not_count(tmp_path):
     assert (found.total.values, found.total.no_data) == (2, 4)
     with pytest.raises(InputError, match="left out"):
         grid_values([write_cloud(tmp_path / "f.las", n=3, echo_flags=(np.zeros(3, "u2"), None, None, ""))],
-                    "z", chosen=PointFilter(flags=1))  # fmt: skip
+                    "z", selection=PointFilter(flags=1))  # fmt: skip
 
 
 def test_real_clouds(riegl, leica, tmp_path):

@@ -169,7 +169,7 @@ def test_pulses_are_found_by_time_and_flag(tiny_strip):
             for block, table in tables
             for row in np.unique(table.waveform[(table.flags & bits) != 0])
         )
-        wanted = waveform.Wanted(chosen=PointFilter(flags=int(bits)), most=4)
+        wanted = waveform.Wanted(selection=PointFilter(flags=int(bits)), most=4)
         places = waveform.find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
         assert [view.point for view in waveform.read_views(reader, scan, places, chain, PULSE)] == flagged[:4]
         with pytest.raises(InputError, match="no echo"):
@@ -361,7 +361,7 @@ def test_waveforms_are_those_with_an_echo_that_meets_a_condition(tiny_strip):
     chain = load_profile("balanced")
     chosen = PointFilter.build(where="number_of_returns >= 2 and not echo_width > 5 and not flag(WEAK)")
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
-        wanted = waveform.Wanted(chosen=chosen, most=4)
+        wanted = waveform.Wanted(selection=chosen, most=4)
         places = waveform.find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
         every = [waveform.Place(unit.number, row, -1) for unit in reader.read_units(scan)
                  for row in np.flatnonzero(unit.packets.owned)[:400].tolist()]  # fmt: skip

@@ -646,7 +646,7 @@ N = 1500
 def voxelize_pulses(strip, folder, *, how=None, size=1.0, ratio=2.0, where=None, **options):
     chosen = PointFilter.build(where=where)
     how = how or Deconvolution()
-    settings = VoxelOptions(size, how, headroom=50.0, reflectance_ratio=ratio, all_crossed=True, chosen=chosen)
+    settings = VoxelOptions(size, how, headroom=50.0, reflectance_ratio=ratio, all_crossed=True, selection=chosen)
     summary = voxelize_strip(strip, folder / "v.npz", settings, system=QUIET, force=True, overwrite=True, **options)
     with np.load(folder / "v.npz") as file:
         return summary, {name: file[name] for name in file}

@@ -68,7 +68,7 @@ def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path, edit_p
         strip = edit_points(tiny_strip, tmp_path / "s.las", order)
     whole, several, single, second, none = (
         voxelize_strip(strip, tmp_path / f"{number}.npz", unit_points=unit_points, options=VoxelOptions(
-            2.0, Deconvolution(iterations=2), chosen=PointFilter.build(where=where)))
+            2.0, Deconvolution(iterations=2), selection=PointFilter.build(where=where)))
         for number, where in enumerate((None, "number_of_returns >= 2", "number_of_returns < 2", "return_number == 2",
                                         "z > 1e6"))
     )  # fmt: skip
@@ -80,8 +80,8 @@ def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path, edit_p
 
 def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
     for work in (
-        lambda chosen: count_returns([cloud], chosen=chosen),
-        lambda chosen: compare_clouds(cloud, cloud, chosen=chosen),
+        lambda chosen: count_returns([cloud], selection=chosen),
+        lambda chosen: compare_clouds(cloud, cloud, selection=chosen),
     ):
         with pytest.raises(
             ConfigError, match=r"^--where: character 12: .*no column 'ecko_width'; did you mean 'echo_width'"
@@ -125,7 +125,7 @@ def test_a_grid_of_no_point_says_why(cloud, tmp_path, where, words):
 
 def test_stats_counts_them_and_what_is_left_out(cloud, split):
     path, number, total = split
-    (found,), _ = count_returns([cloud], chosen=CHOSEN)
+    (found,), _ = count_returns([cloud], selection=CHOSEN)
     (wanted,), _ = count_returns([path])
     assert (found.points, found.left_out) == (number, total - number)
     assert (found.by_number, found.separations, found.flags) == (wanted.by_number, wanted.separations, wanted.flags)
@@ -134,6 +134,6 @@ def test_stats_counts_them_and_what_is_left_out(cloud, split):
 
 def test_clouds_are_compared_at_them(cloud, split):
     path, number, total = split
-    found = compare_clouds(cloud, path, chosen=CHOSEN)
+    found = compare_clouds(cloud, path, selection=CHOSEN)
     assert (found.matched, found.missed, found.extra) == (number, 0, 0)
     assert (found.left_out_a, found.left_out_b) == (total - number, 0)

@@ -51,7 +51,7 @@ class StripJob:
     calibration: Calibration | None = None
     attenuation: tuple[float, float] | None = None
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
-    chosen: PointFilter = PointFilter()
+    selection: PointFilter = PointFilter()
     """What is written."""
     unit_points: int | None = None
     """Of a unit, which one process works on; the cloud does not depend on it."""
@@ -66,7 +66,7 @@ class StripJob:
         given = self.sensor != SensorRequest()
         chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
         # Columns that --where names exactly; the others are those of the input.
-        where = () if self.chosen.where is None else self.chosen.where.columns
+        where = () if self.selection.where is None else self.selection.where.columns
         named = (name for name in where if name in COLUMNS and COLUMNS[name].extra_bytes)
         return with_columns(chain, (*self.columns, *named))
 
@@ -249,4 +249,4 @@ def plan_filter(job: StripJob, layout: OutputLayout) -> PlannedFilter:
 
     standard = {name: RowColumn("standard", name, layout) for name in ("x", "y", "classification")}
     standard["echo_flags"] = RowColumn("computed", "echo_flags", layout)
-    return job.chosen.place(source.path, source.header).plan(standard, find, str(source.path))
+    return job.selection.place(source.path, source.header).plan(standard, find, str(source.path))

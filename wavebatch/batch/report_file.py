@@ -91,7 +91,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
             "pulse_energy": energy,
             **flight,
-            **({"selection": job.chosen.describe()} if job.chosen else {}),
+            **({"selection": job.selection.describe()} if job.selection else {}),
         },
     }
 
@@ -476,7 +476,7 @@ def find_warnings(
     left_out = sum(report.left_out.values())
     if left_out and not report.count("points_out"):
         reasons = ", ".join(f"{n} {LEFT_OUT[name]}" for name, n in report.left_out.items() if n)
-        place = prepared.chosen.chosen.describe_extent(prepared.facts.header)
+        place = prepared.selection.filter.describe_extent(prepared.facts.header)
         line = f"no point is written: of {left_out}, {reasons}{place and '; ' + place}"
         found += warn("nothing-selected", [line])
     points, waveforms, nothing = report.count("points_in"), report.count("waveforms"), ""

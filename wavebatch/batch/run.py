@@ -381,7 +381,7 @@ def check_outputs(jobs: Sequence[StripJob], options: RunOptions) -> None:
 
 def list_read_files(jobs: Sequence[StripJob]) -> list[Path]:
     """Return the files that the jobs read, also those that are read already: no output may replace them."""
-    read = {Path(job.chosen.polygon_file["file"]) for job in jobs if job.chosen.polygon_file is not None}
+    read = {Path(job.selection.polygon_file["file"]) for job in jobs if job.selection.polygon_file is not None}
     return sorted(read.union(*(job.files for job in jobs)))
 
 

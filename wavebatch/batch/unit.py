@@ -72,7 +72,7 @@ class Prepared:
     units: int
     choice: ChainChoice
     layout: OutputLayout
-    chosen: PlannedFilter
+    selection: PlannedFilter
     """Chooses the rows that are written, from UnitRows."""
     report: RunReport
     """Timing of the preparation, and how many points have lost their packets."""
@@ -100,7 +100,7 @@ class Prepared:
     @property
     def needed(self) -> tuple[str, ...]:
         """The computed columns that decide which rows are written."""
-        columns = [one for one in self.chosen.columns.values() if isinstance(one, RowColumn)]
+        columns = [one for one in self.selection.columns.values() if isinstance(one, RowColumn)]
         return tuple(one.name for one in columns if one.kind == "computed")
 
 
@@ -194,11 +194,11 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
             if job.calibration is not None or setup.sent.energy is not None or needs_sensor(job.chain):
                 doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
-            chosen = plan_filter(job, layout)
+            selection = plan_filter(job, layout)
             units = reader.unit_count()
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
     report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
-    found = choice, layout, chosen, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
+    found = choice, layout, selection, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 
@@ -278,7 +278,7 @@ def finish_rows(
     UnitResult
     """
     start = Seconds.now()
-    codes = prepared.chosen.test(UnitRows(rows, columns), len(rows))
+    codes = prepared.selection.test(UnitRows(rows, columns), len(rows))
     kept = codes == 0
     numbers = dict(zip(("", *REASONS), np.bincount(codes, minlength=len(REASONS) + 1).tolist(), strict=True))
     number, total = split_numbers(rows[codes == len(REASONS)])
@@ -346,7 +346,7 @@ def solve_unit(
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
     layout, needed = prepared.layout, prepared.needed
     if echoes_mode:
-        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.chosen.drop_flags)
+        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.selection.drop_flags)
     else:
         made = assemble_returns(unit, echoes, layout, needed)
     timing["assemble"] = Seconds.now() - start

@@ -82,7 +82,7 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
     asked = shared.from_options(RunOptions, options)
     chain, request = find_request(asked)  # pulse and chain are chosen as `wavebatch run` chooses them
     how = shared.from_options(CalibrationOptions, options, sensor=read_sensor(asked), chain=chain, request=request,
-                              chosen=PointFilter(where=options["where"]))  # fmt: skip
+                              selection=PointFilter(where=options["where"]))  # fmt: skip
     flight = calibrate_flight(paths, load_targets(targets) if targets else [], how)
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)

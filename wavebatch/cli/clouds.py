@@ -77,8 +77,8 @@ def stats(clouds: tuple[Path, ...], output: Path | None, **options: Any) -> None
         failed.append(error)
         talk(f"error: {error}")
 
-    chosen = PointFilter(where=options["where"])
-    each, total = returns.count_returns(files, skip, divisions=divisions, chosen=chosen)
+    selection = PointFilter(where=options["where"])
+    each, total = returns.count_returns(files, skip, divisions=divisions, selection=selection)
     if output is not None and failed:
         talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
     elif output is not None:
@@ -203,7 +203,7 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     paths = find_clouds(clouds, options)
     check_raster(output, overwrite=options["overwrite"])
     forest = shared.from_options(ForestOptions, options) if options["forest"] else None
-    how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options), forest=forest)
+    how = shared.from_options(GridOptions, options, columns=columns, selection=choose_points(options), forest=forest)
     found = write_grid(paths, output, how, overwrite=options["overwrite"])
     layout = found.layout
     talk(*(f"warning: {line}" for line in doubt_clouds(paths, columns)))

@@ -154,7 +154,7 @@ def _compare(a: Path, b: Path | None, options: dict) -> Comparison:
     if b is not None and b.suffix.lower() == ".npz":
         raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
     how = {} if options["within"] is None else {"tolerance_ns": options["within"]}
-    how["chosen"] = PointFilter(where=options["where"])
+    how["selection"] = PointFilter(where=options["where"])
     return compare_truth(a, truth, **how) if truth else compare_clouds(a, b, **how)
 
 

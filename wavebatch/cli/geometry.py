@@ -234,7 +234,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
         if options[name] is not None and options["calibration"] is None:
             raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")
     settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options),
-                                   chosen=PointFilter(where=options["where"]))  # fmt: skip
+                                   selection=PointFilter(where=options["where"]))  # fmt: skip
     names = ("direction", "headerless", "overwrite", "force", "profiles")
     asked = shared.from_options(RunOptions, options)
     more: dict[str, Any] = {"sensor": read_sensor(asked), **{name: options[name] for name in names}}

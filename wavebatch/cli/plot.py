@@ -117,20 +117,20 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
     from wavebatch.tools.cells import Clouds
     from wavebatch.tools.plots import draw_cloud
 
-    column, chosen = options["column"], choose_points(options)
-    if Clouds(clouds, (column,), chosen).facts.is_flags:
+    column, selection = options["column"], choose_points(options)
+    if Clouds(clouds, (column,), selection).facts.is_flags:
         for name in ("bins", "limits", "each", "by", "counts"):
             if options[name]:
                 option = "--range" if name == "limits" else f"--{name}"
                 raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-        flags = draw_cloud.count_points_by_flag(clouds, column, chosen)
+        flags = draw_cloud.count_points_by_flag(clouds, column, selection)
         draw_cloud.draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
         names, rows, edges = flags.names, flags.counts.reshape(-1, 1), ()
         total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
         how = {name: options[name] for name in ("bins", "limits", "each", "by")}
-        found = draw_cloud.count_values(clouds, column, chosen, **how)
+        found = draw_cloud.count_values(clouds, column, selection, **how)
         look = {name: options[name] for name in ("log", "counts", "overwrite")}
         draw_cloud.draw_cloud_histogram(found, output, **look)
         names, rows, edges = found.names, found.counts, found.edges.tolist()
@@ -372,8 +372,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         if options[key]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
     (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
-    chosen = PointFilter(flags=read_flags(options["flags"]), where=options["where"])
-    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], chosen=chosen)
+    selection = PointFilter(flags=read_flags(options["flags"]), where=options["where"])
+    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], selection=selection)
     # The waveforms, and the chain that they are run through.
     chain, request = find_request(shared.from_options(RunOptions, options))
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])

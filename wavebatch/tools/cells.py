@@ -82,12 +82,12 @@ class CloudData:
 class Clouds:
     """Several clouds that are read as one, as often as needed; only one is open at a time.
 
-    columns: read of each point; of the first one, None counts points. chosen: the points that are used.
+    columns: read of each point; of the first one, None counts points. selection: the points that are used.
     Raises InputError if a cloud cannot be read, ConfigError if it lacks the column or the flags or units differ.
     """
 
-    def __init__(self, paths: Sequence[Path], columns: Sequence[str | None], chosen: PointFilter = EVERY) -> None:
-        self.paths, self._columns, self.chosen = tuple(paths), tuple(columns), chosen
+    def __init__(self, paths: Sequence[Path], columns: Sequence[str | None], selection: PointFilter = EVERY) -> None:
+        self.paths, self._columns, self.selection = tuple(paths), tuple(columns), selection
         found: list[Sequence[ColumnFacts]] = []
         for path in self.paths:
             with self._open(path) as reader:
@@ -115,7 +115,7 @@ class Clouds:
         """A reader that gives the chosen points."""
         reader = ColumnReader(path, *self._columns)
         with undoing(reader.close):
-            reader.select(self.chosen)
+            reader.select(self.selection)
         return reader
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
@@ -140,7 +140,7 @@ class Clouds:
             return InputError(f"{where}: holds no points: nothing to draw")
         reasons = []
         if tally.left_out:
-            by = "by --where" if self.chosen.where is not None else "by their flags"
+            by = "by --where" if self.selection.where is not None else "by their flags"
             reasons.append(f"{tally.left_out} of {tally.points} points are left out {by}")
         if tally.no_data:
             reasons.append(f"{tally.no_data} have no data in {self.facts.name}")
@@ -482,7 +482,7 @@ def grid_values(
     paths: Sequence[Path],
     column: str | None,
     statistic: str = "mean",
-    chosen: PointFilter = EVERY,
+    selection: PointFilter = EVERY,
     *,
     size: float | None = None,
     bounds: Box | None = None,
@@ -499,7 +499,7 @@ def grid_values(
         raise ConfigError(f"cells must be at least {LEAST_SIZE:g} and at most {LARGEST_SIZE:g} m long, got {size:g}")
     check_cells(statistic, bounds, paths)
     check_statistic(column, statistic)
-    clouds = Clouds(paths, (column,), chosen)
+    clouds = Clouds(paths, (column,), selection)
     check_statistic(column, statistic, clouds.facts, paths[0])
     crs = check_crs(paths)
     total, sample, box = survey_places(clouds, bounds)

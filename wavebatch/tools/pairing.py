@@ -98,20 +98,20 @@ class Comparison:
 
 
 def compare_clouds(
-    a: Path, b: Path, *, tolerance_ns: float = 1.0, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
+    a: Path, b: Path, *, tolerance_ns: float = 1.0, selection: PointFilter = EVERY, held: int = BUCKET_ROWS
 ) -> Comparison:
     """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
 
     Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
     nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
-    without an echo are ignored. chosen: only these points are compared, in both clouds. held: rows in memory at a
+    without an echo are ignored. selection: only these points are compared, in both clouds. held: rows in memory at a
     time; large clouds need room in TMPDIR.
     Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance, an unknown column, or
     coordinates without a length.
     """
     with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns, held) as task:
         for reader, side in ((first, 0), (second, 1)):
-            reader.select(chosen)
+            reader.select(selection)
             for rows in read_echoes(reader):
                 task.add(side, rows)
         found = task.finish(str(a), str(b))
@@ -130,15 +130,15 @@ PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
 
 
 def compare_truth(
-    a: Path, truth: Path, *, tolerance_ns: float = 1.5, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
+    a: Path, truth: Path, *, tolerance_ns: float = 1.5, selection: PointFilter = EVERY, held: int = BUCKET_ROWS
 ) -> Comparison:
     """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does.
 
-    chosen: only these points of the cloud; the truth is whole, so that true echoes of other points are missed. held:
+    selection: only these points of the cloud; the truth is whole, so that true echoes of other points are missed. held:
     rows in memory at a time.
     """
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
-        cloud.select(chosen)
+        cloud.select(selection)
         points = max(cloud.point_count, reference.meta.get("packets", 0))
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
         buckets = count_buckets(points, held)

@@ -301,7 +301,7 @@ class GridOptions:
 
     columns: tuple[str, ...] = ()
     """A band for each; points are counted without one."""
-    chosen: PointFilter = EVERY
+    selection: PointFilter = EVERY
     """The points that are used."""
     statistic: Literal["mean", "median", "min", "max", "std", "count", "density"] = option(
         "mean", "Statistic of the values in a cell; density is points per area."
@@ -342,7 +342,7 @@ def write_grid(
     """
     metrics = None
     if options.forest is not None:
-        if options.chosen:
+        if options.selection:
             raise ConfigError("--forest: metrics need all voxels of a cell: leave out --where, --class and flags; "
                               "--bbox takes whole cells")  # fmt: skip
         metrics = Forest(paths, options.size, options.forest)
@@ -374,7 +374,7 @@ def write_grid(
     if metrics is not None and unit != "m":
         raise ConfigError(f"{paths[0]}: --forest: voxels are measured in metres, and coordinates are in {unit}; "
                           "project the strip to a CRS in metres first")  # fmt: skip
-    clouds = cells.Clouds(paths, options.columns or (None,), options.chosen)
+    clouds = cells.Clouds(paths, options.columns or (None,), options.selection)
     for one in clouds.every:
         cells.check_statistic(one.name, options.statistic, one, paths[0])
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
@@ -387,9 +387,9 @@ def write_grid(
             largest = np.maximum(largest, np.nan_to_num(np.abs(rows["values"])).max(axis=0, initial=0.0))
             points += len(rows)
     if not points:
-        wanted, chosen = ["a position within --bbox" if options.bbox else "a position"], options.chosen
-        wanted += ["the chosen flags"] if chosen.flags or chosen.drop_flags else []
-        wanted += ["what --where asks for"] if chosen.where is not None else []
+        wanted, selection = ["a position within --bbox" if options.bbox else "a position"], options.selection
+        wanted += ["the chosen flags"] if selection.flags or selection.drop_flags else []
+        wanted += ["what --where asks for"] if selection.where is not None else []
         raise InputError(f"{clouds.paths[0]}: no raster: no point has {' and '.join(wanted)}")
     box = options.bbox or (*low.tolist(), *high.tolist())
     if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):

@@ -362,14 +362,14 @@ def count_returns(
     skip: Callable[[InputError], None] | None = None,
     *,
     divisions: Sequence[Division] = (),
-    chosen: PointFilter = EVERY,
+    selection: PointFilter = EVERY,
     held: int = BUCKET_ROWS,
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 
     A pulse is the points of equal GPS time and scanner in a cloud; if times do not separate pulses, a run of rising
     return numbers.
-    chosen: count only these points. divisions: count also by areas; a pulse belongs, with all its returns, to the
+    selection: count only these points. divisions: count also by areas; a pulse belongs, with all its returns, to the
     area of its first return. skip: called with the InputError of a cloud that cannot be read, which is then left out;
     without it, the error is raised.
     held: rows in memory at a time; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
@@ -377,7 +377,7 @@ def count_returns(
     each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
     for path in clouds:
         try:
-            tally = _tally_cloud(Path(path), divisions, chosen, held)
+            tally = _tally_cloud(Path(path), divisions, selection, held)
         except InputError as error:
             if skip is None:
                 raise
@@ -399,10 +399,10 @@ def pulses_told_apart(reader: CloudReader) -> bool:
     return rows is None or len(np.unique(rows["gps_time"])) * MOST_RETURNS >= len(rows)
 
 
-def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter, held: int) -> _Tally:
+def _tally_cloud(path: Path, divisions: Sequence[Division], selection: PointFilter, held: int) -> _Tally:
     with CloudReader(path, RETURN_DTYPE) as reader:
         by_time = pulses_told_apart(reader)  # by all points
-        reader.select(chosen)
+        reader.select(selection)
         placed = [one.place(path) if isinstance(one, PolygonSet) else (one, "") for one in divisions]
         areas = [AreaTally(division) for division, _ in placed]
         tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)

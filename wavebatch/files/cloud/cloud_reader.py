@@ -169,7 +169,7 @@ class CloudReader(Closing):
             self.records = raw
             yield self._convert(raw)
 
-    def plan(self, chosen: PointFilter) -> PlannedFilter:
+    def plan(self, selection: PointFilter) -> PlannedFilter:
         """Return the filter for raw records of this file, which also works after the file is closed.
 
         Raises ConfigError for a column that there is not, and for polygons that cannot be placed.
@@ -180,11 +180,11 @@ class CloudReader(Closing):
             "classification": las.read_classes,
             **({"echo_flags": self.read_flags} if self.has_flags else {}),
         }
-        return chosen.plan(standard, lambda column: self.find_column(column)[1], str(self.path))
+        return selection.plan(standard, lambda column: self.find_column(column)[1], str(self.path))
 
-    def select(self, chosen: PointFilter) -> None:
+    def select(self, selection: PointFilter) -> None:
         """Let the reader give only the points that a filter chooses; raises as `plan`."""
-        self._filter = self.plan(chosen) if chosen else None
+        self._filter = self.plan(selection) if selection else None
 
     def read_flags(self, raw: np.ndarray) -> np.ndarray:
         """Return the EchoFlag bits of raw records, u2 (n,); 0 where the cloud has no flags."""

@@ -194,7 +194,7 @@ def check_bbox(bbox: Sequence[float], path: Path, header: LasHeader) -> None:
 class PlannedFilter:
     """A filter whose columns are found, from `PointFilter.plan`; picklable if they are."""
 
-    chosen: PointFilter
+    filter: PointFilter
     standard: Mapping[str, ReadColumn]
     columns: Mapping[str, ReadColumn]
     """Those of --where by their names there."""
@@ -214,22 +214,22 @@ class PlannedFilter:
 
     def _test(self, rows: Any) -> Iterator[tuple[str, np.ndarray]]:
         """Each test that is asked for, and whether the rows meet it, bool (n,)."""
-        chosen, read = self.chosen, self.standard
-        if chosen.drop_flags:
-            yield "drop_flags", (read["echo_flags"](rows) & np.uint16(chosen.drop_flags)) == 0
-        if chosen.flags:
-            yield "flags", (read["echo_flags"](rows) & np.uint16(chosen.flags)) != 0
-        if chosen.classes:
-            yield "classes", np.isin(read["classification"](rows), chosen.classes)
-        if chosen.bbox is not None or chosen.polygons:
+        asked, read = self.filter, self.standard
+        if asked.drop_flags:
+            yield "drop_flags", (read["echo_flags"](rows) & np.uint16(asked.drop_flags)) == 0
+        if asked.flags:
+            yield "flags", (read["echo_flags"](rows) & np.uint16(asked.flags)) != 0
+        if asked.classes:
+            yield "classes", np.isin(read["classification"](rows), asked.classes)
+        if asked.bbox is not None or asked.polygons:
             x, y = read["x"](rows), read["y"](rows)
-            if chosen.bbox is not None:
-                west, south, east, north = chosen.bbox
+            if asked.bbox is not None:
+                west, south, east, north = asked.bbox
                 yield "bbox", (x >= west) & (x <= east) & (y >= south) & (y <= north)
-            if chosen.polygons:
+            if asked.polygons:
                 from wavebatch.files.geojson import find_inside
 
-                inside = [find_inside(one.rings, x, y) for one in chosen.polygons]
+                inside = [find_inside(one.rings, x, y) for one in asked.polygons]
                 yield "polygon", np.logical_or.reduce(inside)
-        if chosen.where is not None:
-            yield "where", chosen.where.choose({name: column(rows) for name, column in self.columns.items()})
+        if asked.where is not None:
+            yield "where", asked.where.choose({name: column(rows) for name, column in self.columns.items()})

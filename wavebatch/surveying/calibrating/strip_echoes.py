@@ -80,7 +80,7 @@ class CalibrationOptions:
     """Where packet vectors point: auto, toward or away."""
     energy: str | None = None
     """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
-    chosen: PointFilter = EVERY
+    selection: PointFilter = EVERY
     """Only echoes of pulses with a chosen return count."""
     before: Calibration | None = None
     """Of the strips of the flight that were read before, by whose energies those of the next ones count."""
@@ -160,9 +160,9 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         Where the strip cannot be read or the sensor's position is unknown.
     """
     keep = None
-    if options.chosen:
+    if options.selection:
         with CloudReader(path) as cloud:
-            keep = cloud.plan(options.chosen)
+            keep = cloud.plan(options.selection)
     with StripReader(path, direction=options.direction) as reader, reader.scan() as scan:
         chain = options.chain or widest_chain()
         setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)

@@ -513,7 +513,7 @@ def build_calibration(
     )
     # The constant of all together serves files of tools that know no channels; its error covers how far they differ.
     apart = float(np.std([row.constant for row in channels])) / whole.constant
-    facts, pulse, where = source.reader.facts, source.system.sigma_ref, options.chosen.where
+    facts, pulse, where = source.reader.facts, source.system.sigma_ref, options.selection.where
     decomposer = next(step.stage.name for step in source.chain.steps if step.stage.kind == "decompose")
     return Calibration(
         constant=whole.constant,

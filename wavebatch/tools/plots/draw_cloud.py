@@ -83,7 +83,7 @@ class FlagCounts(CloudData):
 def count_values(
     paths: Sequence[Path],
     column: str,
-    chosen: PointFilter = EVERY,
+    selection: PointFilter = EVERY,
     *,
     bins: int | None = None,
     limits: tuple[float, float] | None = None,
@@ -97,7 +97,7 @@ def count_values(
     each: one series per cloud instead of one for all. by: one series per value of this column.
     Raises InputError without any value, ConfigError for a column of flags, and more than MOST_GROUPS groups.
     """
-    clouds = Clouds(paths, (column,) if by is None else (column, by), chosen)
+    clouds = Clouds(paths, (column,) if by is None else (column, by), selection)
     if clouds.facts.is_flags:
         raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits: there is no histogram of their values")
     if by is not None and clouds.every[1].is_flags:
@@ -216,10 +216,10 @@ def place_edges(sample: np.ndarray, low: float, high: float, step: float, bins: 
     return np.unique(np.linspace(low, high, number + 1))
 
 
-def count_points_by_flag(paths: Sequence[Path], column: str, chosen: PointFilter = EVERY) -> FlagCounts:
+def count_points_by_flag(paths: Sequence[Path], column: str, selection: PointFilter = EVERY) -> FlagCounts:
     """Counts the points of the clouds per flag. Raises InputError without any point."""
     counts, clean, total = np.zeros(len(EchoFlag), np.int64), 0, Tally()
-    clouds = Clouds(paths, (column,), chosen)
+    clouds = Clouds(paths, (column,), selection)
     for _, rows, tally in clouds.read():
         total += tally
         flags = rows["values"][:, 0].astype(np.uint16)

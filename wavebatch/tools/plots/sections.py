@@ -42,7 +42,7 @@ _PIECE = 100_000
 
 
 def open_heights(
-    paths: Sequence[Path], column: str | None, chosen: PointFilter
+    paths: Sequence[Path], column: str | None, selection: PointFilter
 ) -> tuple[cells.Clouds | VoxelFile | SegmentFiles, CrsWords]:
     """Clouds or one file of voxels, whose rows have the height as second value; segments have those of both ends."""
     if is_segments(paths[0]):
@@ -51,9 +51,9 @@ def open_heights(
     if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
     if voxels:
-        voxel = VoxelFile(paths[0], column, chosen)
+        voxel = VoxelFile(paths[0], column, selection)
         return voxel, CrsWords(voxel.crs)
-    clouds = cells.Clouds(paths, (column, "z"), chosen)
+    clouds = cells.Clouds(paths, (column, "z"), selection)
     return clouds, cells.check_crs(clouds.paths)
 
 
@@ -83,7 +83,7 @@ class Section(cells.CloudData):
 def cut_section(
     paths: Sequence[Path],
     column: str | None,
-    chosen: PointFilter = EVERY,
+    selection: PointFilter = EVERY,
     *,
     line: tuple[float, float, float, float] | None = None,
     width: float | None = None,
@@ -95,7 +95,7 @@ def cut_section(
     fiftieth of the line, for voxels at least one voxel. most: an even sample of so many points at the most. Raises
     InputError if no point lies there.
     """
-    clouds, crs = open_heights(paths, column, chosen)
+    clouds, crs = open_heights(paths, column, selection)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
     if crs.unit == "deg":
         raise ConfigError(f"{paths[0]}: coordinates are degrees, heights are not: project the cloud to draw a section")
@@ -197,7 +197,7 @@ def measure_profile(
     paths: Sequence[Path],
     column: str | None,
     statistic: str,
-    chosen: PointFilter = EVERY,
+    selection: PointFilter = EVERY,
     *,
     size: float | None = None,
     each: bool = False,
@@ -209,7 +209,7 @@ def measure_profile(
     size: height of a bin, by default about a sixtieth of all. each: one series per cloud instead of one for all. Far
     outliers in height are left out and counted. Raises InputError without any value.
     """
-    clouds, crs = open_heights(paths, column, chosen)
+    clouds, crs = open_heights(paths, column, selection)
     cells.check_statistic(column, statistic, clouds.facts, paths[0])
 
     def pick(_: int, rows: np.ndarray) -> np.ndarray:

@@ -58,7 +58,7 @@ class Wanted:
     """Indices of points in the file."""
     times: tuple[float, ...] = ()
     """GPS times [s]; the nearest pulse of each."""
-    chosen: PointFilter = PointFilter()
+    selection: PointFilter = PointFilter()
     """The first waveforms with an echo that it chooses."""
     most: int | None = None
     """Most waveforms with such an echo, or spread evenly; None: FEW of them, or a full sheet."""
@@ -106,7 +106,7 @@ def find_places(
     too_many = ConfigError(f"{path}: too many waveforms for a picture; {wanted.limit} fit{more}")
     if wanted.number > wanted.limit:
         raise too_many
-    if wanted.chosen:
+    if wanted.selection:
         return _find_flagged(reader, scan, wanted, run)
     numbers: list[int] = []
     if wanted.random:
@@ -188,19 +188,19 @@ def _find_flagged(
             hits = []
             for block, index in reader.read_rows(unit, rows[begin : begin + _BLOCK], _BLOCK):
                 table = run(block)
-                keep = keep or _plan(wanted.chosen, table)
+                keep = keep or _plan(wanted.selection, table)
                 kept = keep.test((table, len(block)), len(table)) == 0
                 hits += index[np.unique(table.waveform[kept])].tolist()
             found += [_place(unit, base, row) for row in sorted(hits)]
             if len(found) >= wanted.number:
                 return found[: wanted.number]
     if not found:
-        text = "has one of these flags" if wanted.chosen.where is None else f"meets {wanted.chosen.where.text!r}"
+        text = "has one of these flags" if wanted.selection.where is None else f"meets {wanted.selection.where.text!r}"
         raise InputError(f"{reader.facts.path}: no echo {text}: nothing to draw")
     return found
 
 
-def _plan(chosen: PointFilter, some: EchoTable) -> PlannedFilter:
+def _plan(selection: PointFilter, some: EchoTable) -> PlannedFilter:
     """The filter for tables of echoes like this one, given with their numbers of waveforms."""
     made: dict[str, ReadColumn] = {
         "echo_time": lambda rows: rows[0].time,
@@ -214,7 +214,7 @@ def _plan(chosen: PointFilter, some: EchoTable) -> PlannedFilter:
             raise ConfigError(f"echoes have no column {name!r}; {nearest(name, have)}")
         return made.get(name) or (lambda rows: rows[0].attributes[name])
 
-    return chosen.plan(made, find, "echoes")
+    return selection.plan(made, find, "echoes")
 
 
 # Views

@@ -453,9 +453,9 @@ class VoxelFile:
     column.
     """
 
-    def __init__(self, path: Path, column: str | None, chosen: PointFilter) -> None:
+    def __init__(self, path: Path, column: str | None, selection: PointFilter) -> None:
         self.paths, self._column = (path,), column
-        if chosen.flags or chosen.drop_flags:
+        if selection.flags or selection.drop_flags:
             raise ConfigError(f"{path}: voxels have no echo_flags to select by")
         what, remedy = "voxels of `wavebatch voxelize`", "make them again"
         columns = {f"{column.name}?": ("fu", 1) for column in COLUMNS}

@@ -94,7 +94,7 @@ class VoxelOptions(CheckedOptions):
     reflectance_ratio: Annotated[float | None, Range(LOWEST, HIGHEST)] = option(
         None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
     )
-    chosen: PointFilter = PointFilter()
+    selection: PointFilter = PointFilter()
     """Use only pulses of which a return is chosen, with all of their signal."""
     energy: str | None = None
     """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
@@ -200,9 +200,9 @@ def voxelize_strip(
     with protecting([strip]):
         Draft(target, overwrite=True).discard()  # before the work: whether it can be written
     keep = None  # the filter for the points of the strip, where it leaves any out
-    if options.chosen:
+    if options.selection:
         with CloudReader(strip) as cloud:
-            keep = cloud.plan(options.chosen)
+            keep = cloud.plan(options.selection)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
@@ -435,7 +435,7 @@ def _describe(
         "all_crossed": options.all_crossed or options.forest,
         "forest": options.forest,
         "ground_height_m": options.ground_height,
-        "where": None if options.chosen.where is None else options.chosen.where.text,
+        "where": None if options.selection.where is None else options.selection.where.text,
         "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
         "system": describe_system(pulse),
         "calibration": None if calibration is None else calibration.describe(),
