@@ -147,13 +147,18 @@ def test_strips_of_three_headings_tell_light_that_falls_from_side_to_side(rng, s
     value = rng.normal(-1, 0.4, 3000)[cell] - view["angle"] + rng.normal(0, 0.01, len(cell))
     ties = Ties(cell, source, value, zero + 0.01, zero, zero, np.stack([place[cell], zero], axis=1), 5.0, view)
     anchors = Anchors(np.zeros(len(strips)), np.full(len(strips), 0.01), None)
-    adjusted, (most, square, fourth, side), edge, left_open = fit_swath(ties, anchors, np.zeros(len(strips), VIEW))
+    at_targets, one = np.zeros(len(strips), VIEW), np.zeros(len(strips), int)
+    adjusted, (most, square, fourth, side), edge, left_open = fit_swath(ties, anchors, at_targets, one)
     assert most == pytest.approx(0.1, abs=0.001) and 0.0 < edge < 0.05
     if is_told:
         assert side == pytest.approx(0.1, abs=0.01) and abs(square + fourth) < 0.02 and left_open is None
         assert np.abs(adjusted.value).max() < 0.02
     else:
         assert side == 0 and 0.03 < left_open < 0.2
+    # Without a term, strips of one heading differ in their constants: light may fall by as much, or they drift.
+    _, swath, edge, left_open = fit_swath(ties, anchors, at_targets, one, asked=False)
+    assert swath == () and edge == 0.0
+    assert left_open == (None if is_told else pytest.approx(0.05 * (strips == "ac"), abs=0.02))
 
 
 def test_sources_without_ties_stay_unknown(rng):

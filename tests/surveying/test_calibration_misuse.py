@@ -153,13 +153,24 @@ def test_light_that_falls_from_side_to_side_is_fitted_by_three_strips(tmp_path, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strips", ["ab", "ac"])
-def test_light_that_falls_from_side_to_side_is_an_error_where_strips_leave_it_open(tmp_path, one_side, strips):
-    found, said = calibrate(one_side, "--scan-angle", strips=[f"{name}.las" for name in strips])
+@pytest.mark.parametrize(("strips", "asked"), [("ab", ["--scan-angle"]), ("ac", ["--scan-angle"]), ("ac", [])])
+def test_light_that_falls_from_side_to_side_is_an_error_where_strips_leave_it_open(tmp_path, one_side, strips, asked):
+    """Strips of one heading, without a term, had 27 % of the values within an error of 3 %, in silence."""
+    found, said = calibrate(one_side, *asked, strips=[f"{name}.las" for name in strips])
     assert "these strips do not show whether light falls from one side" in said
-    assert found.swath[3] == 0.0 and all(0.05 < row.relative_error < 0.13 for row in found.strips)
+    assert not any(found.swath[3:]) and all(0.05 < row.relative_error < 0.13 for row in found.strips)
     off, stated = offsets(one_side, tmp_path)
-    assert np.mean(np.abs(off) < stated) > 0.55
+    assert np.mean(np.abs(off) < stated) > 0.58
+
+
+def test_strips_of_one_heading_and_two_channels_leave_nothing_open_where_light_is_even(tmp_path, one_side):
+    two = replace(SENSOR, gains={1: 1.0, 2: 0.5})
+    for number, start in enumerate(((0, 0), (0, 60))):
+        sensor = replace(two, start=start, time=START + 600 * number)
+        write_strip(tmp_path / f"{number}.las", FARMLAND, sensor, 12_000, seed=31 + number)
+    shutil.copy(one_side / "t.csv", tmp_path)
+    found, said = calibrate(tmp_path, strips=["0.las", "1.las"])
+    assert "from one side" not in said and max(row.relative_error for row in found.strips) < 0.035
 
 
 @pytest.mark.slow
@@ -199,7 +210,7 @@ def test_a_term_over_the_scan_angle_needs_overlap(calibrated):
 
 
 def test_what_a_term_is_known_to_at_the_edge_is_in_the_errors(tmp_path, calibrated, monkeypatch):
-    def fit(ties, anchors, seen):
+    def fit(ties, anchors, seen, channel, *, asked):
         return calibrate_flight.adjust.adjust_constants(ties, anchors), (0.2, 0.0, 0.0, 0.0), 0.4, None
 
     monkeypatch.setattr(calibrate_flight, "fit_swath", fit)

@@ -188,6 +188,10 @@ MOST_EDGE_ERROR = 0.05
 LEAST_LEFT = 0.05
 """What constants and even terms must leave of u (root mean square) for a term that falls from side to side."""
 
+LIKE_PLACES = 0.01
+"""Square of the change of strips from one to the next over that of light from side to side, 2 % over 20 %: where strips
+see a place at angles that are nearly alike, what their constants differ by is such a change."""
+
 _EDGES = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0]])
 """The columns of `swath_columns` at both edges of the swath."""
 
@@ -209,9 +213,9 @@ class Trend(NamedTuple):
 
 
 def fit_swath(
-    ties: adjust.Ties, anchors: adjust.Anchors, seen: np.ndarray
+    ties: adjust.Ties, anchors: adjust.Anchors, seen: np.ndarray, channel: np.ndarray, *, asked: bool = True
 ) -> tuple[adjust.Adjustment, tuple[float, ...], float, float | None]:
-    """Adjust the constants with a term over the scan angle.
+    """Adjust the constants, with a term over the scan angle where it is asked for.
 
     Parameters
     ----------
@@ -219,13 +223,17 @@ def fit_swath(
     anchors : Anchors
     seen : array of VIEW (n,)
         How each source saw the targets.
+    channel : int array, shape (n,)
+        Number of the channel of each source: these differ in gain.
+    asked : bool
+        Whether the term is fitted.
 
     Returns
     -------
     adjusted : Adjustment
         With the constants straight below the sensor.
-    swath : (float, float, float, float)
-        As `Radiometry.swath`.
+    swath : (float, float, float, float) or ()
+        As `Radiometry.swath`; empty where it is not asked for.
     edge : float
         Error of the term at the edge of the swath, relative: constants near it are not known better.
     open_error : float or None
@@ -246,31 +254,32 @@ def fit_swath(
     free = adjust.Anchors(0.0 * anchors.value, 1e3 * np.ones(len(anchors.value)), np.zeros((len(anchors.value), 2)))
     rest = adjust.adjust_constants(falling, free, columns[:, :2], 0).residual
     odd = bool(len(rest) and np.nanstd(rest) > LEAST_LEFT)
-    used = 3 if odd else 2
+    used = (3 if odd else 2) * asked
     adjusted = adjust.adjust_constants(ties, replace(anchors, columns=at_targets[:, :used]), columns[:, :used])
     if len(ties.cell):
         edge = max(float(np.std(adjusted.term_trials @ side[:used], ddof=1)) for side in _EDGES)
-    if not 0 < edge <= MOST_EDGE_ERROR:
+    if asked and not 0 < edge <= MOST_EDGE_ERROR:
         raise InputError(
             f"--scan-angle: the overlaps do not show the light at the edge of the swath to {100 * MOST_EDGE_ERROR:.0f} "
             "%; give strips that overlap by a third or more, or leave --scan-angle out"
         )
-    if odd:
-        return adjusted, (most, *map(float, adjusted.terms)), edge, None
+    swath = (most, *map(float, adjusted.terms), *(0.0,) * (3 - used)) if asked else ()
+    if odd or not len(ties.cell):
+        return adjusted, swath, edge * asked, None
     # The error of the constants if they differ because each strip was seen from another side, or if the light falls
     # from side to side and not to both edges, where that explains the overlaps nearly as well.
-    other = adjust.adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
-    side = columns[:, 2]
-    n, grid = len(adjusted.value), np.linspace(-1.0, 1.0, 21)
-    place = np.bincount(ties.source, side, n) / np.maximum(adjusted.ties, 1)
+    side, n, grid = columns[:, 2], len(adjusted.value), np.linspace(-1.0, 1.0, 21)
     known = np.isfinite(adjusted.value) & (adjusted.ties > 0)
-    off, value = place[known] - place[known].mean(), adjusted.value[known] - adjusted.value[known].mean()
-    drift = float(abs(off @ value) / max(off @ off, 1e-3) * np.sqrt(np.mean(side**2)))
-    apart = float(np.mean(adjusted.value[known] - other.value[known]))
-    apart = apart + swath_columns(grid, 1.0) @ [*adjusted.terms, -other.terms[0]]
-    alike = other.scatter < max(LEAST_SPREAD, adjusted.scatter / EXPLAINED)
-    error = max(drift, float(np.sqrt(np.mean(apart**2))) if alike else 0.0)
-    return adjusted, (most, *map(float, adjusted.terms), 0.0), edge, error
+    of = np.unique(channel[known], return_inverse=True)[1]
+    place = np.bincount(ties.source, side, n) / np.maximum(adjusted.ties, 1)
+    off, value = (one[known] - (np.bincount(of, one[known]) / np.bincount(of))[of] for one in (place, adjusted.value))
+    error = float(abs(off @ value) / (off @ off + LIKE_PLACES) * np.quantile(np.abs(side), 0.68))
+    other = adjust.adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
+    if asked and other.scatter < max(LEAST_SPREAD, adjusted.scatter / EXPLAINED):
+        apart = float(np.mean(adjusted.value[known] - other.value[known]))
+        apart = apart + swath_columns(grid, 1.0) @ [*adjusted.terms, -other.terms[0]]
+        error = max(error, float(np.sqrt(np.mean(apart**2))))
+    return adjusted, swath, edge * asked, error
 
 
 def find_trend(
@@ -409,14 +418,11 @@ def calibrate_flight(
             value[number], error[number] = math.log(given.constant), math.sqrt(max(rest, 1e-6))
             seen[number] = source.strip.seen[source.channel]
     anchors = adjust.Anchors(value, error)
-    swath: tuple[float, ...] = ()
-    edge, open_error = 0.0, None
-    if options.scan_angle:
-        adjusted, swath, edge, open_error = fit_swath(ties, anchors, seen)
+    channel = np.array([source.channel for source in sources])
+    adjusted, swath, edge, open_error = fit_swath(ties, anchors, seen, channel, asked=options.scan_angle)
+    if swath:
         ties = replace(ties, value=ties.value + swath_columns(ties.view["angle"], swath[0]) @ swath[1:])
         anchors = replace(anchors, value=anchors.value - swath_columns(seen["angle"], swath[0]) @ swath[1:])
-    else:
-        adjusted = adjust.adjust_constants(ties, anchors)
     calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath).widened(edge)
     angle, of = ties.view["angle"], ties.cell
     within = angle - (np.bincount(of, angle) / np.bincount(of))[of]
@@ -448,8 +454,8 @@ def calibrate_flight(
     if open_error is not None and open_error > LEAST_SPREAD:
         calibration = calibration.widened(open_error)
         more.append(
-            "--scan-angle: these strips do not show whether light falls from one side of the swath to the other: the "
-            f"error of the constants grows by {100 * open_error:.1f} %; give three strips, one of another heading"
+            "these strips do not show whether light falls from one side of the swath to the other: the error of the "
+            f"constants grows by {100 * open_error:.1f} %; give three strips, one of another heading, and --scan-angle"
         )
     return FlightCalibration(replace(calibration.widened(bent), notes=(*notes, *more)), pairs, ties.size)
 
