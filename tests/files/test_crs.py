@@ -471,6 +471,26 @@ def test_utm_zones(code, name, meridian, northing):
     assert f'"central_meridian",{meridian}]' in text and f'"false_northing",{northing}]' in text
 
 
+@pytest.mark.parametrize(
+    ("records", "named"),
+    [
+        ((geo_keys(k1024=1, k3072=32633),), "(EPSG:25832 and EPSG:32633) contradict"),
+        ((geo_keys(k1024=1, k3072=2263),), "(EPSG:25832 and EPSG:2263) contradict"),
+        (([build_wkt(build_utm(25833))],), "records of the CRS contradict"),
+        ((geo_keys(k1024=1, k3072=32632), [build_wkt(build_utm(25832))]), ""),
+    ],
+)
+def test_records_that_give_two_places_are_named(tmp_path, records, named):
+    """A strip that was projected, and kept the keys of the old zone, lay there for half of all programs."""
+    path = tmp_path / "s.las"
+    simulate_strip("flat", path, pulses=300, seed=1)
+    add_record(path, build_wkt(build_utm(25832)))
+    for (record,) in records:
+        add_record(path, record)
+    done = run_command("check", str(path))
+    assert (done.exit_code, named in done.stdout) == (int(bool(named)), True), done.output
+
+
 @pytest.mark.parametrize("code", [32600, 32661, 25827, 25839, 26924, 31468, 4326, 0])
 def test_other_codes_are_not_guessed(code):
     assert build_utm(code) is None

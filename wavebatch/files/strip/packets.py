@@ -29,7 +29,7 @@ from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import Draft, list_packet_files, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads, undoing
 from wavebatch.files.las import header as las
-from wavebatch.files.las.crs import CrsUnits, read_crs
+from wavebatch.files.las.crs import CrsUnits, build_utm, find_code, find_epsg, read_crs
 from wavebatch.files.las.read_points import CheckedHeader, open_points, read_checked_header
 from wavebatch.files.las.write_points import PointFile, waveform_head
 from wavebatch.kernels.packets import MOST_BYTES, decode_packets
@@ -95,6 +95,17 @@ def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:
         if len(offsets) and int(offsets.min()) < las.EVLR_HEADER_SIZE:
             place = replace(place, base=0)  # in a .wdp without header such offsets count from its first byte
     crs, units = read_crs(path, header)
+    # Programs that convert a strip may leave the record of the kind that they do not write as it was.
+    codes = [find_epsg(crs or ""), find_code(header.vlrs)]
+    zones = {wkt.partition("PROJECTION")[2].rpartition(",AUTHORITY")[0] for wkt in map(build_utm, filter(None, codes))
+             if wkt}  # fmt: skip
+    wkts = [vlr.payload for vlr in header.vlrs if las.is_projection(vlr) and vlr.record_id == las.WKT_ID]
+    texts = {payload.rstrip(b"\0 ") for payload in wkts}
+    sizes = {round(unit.horizontal, 9) for unit in units if unit.horizontal and np.isfinite(unit.horizontal)}
+    if max(len(zones), len(texts), len(sizes)) > 1:
+        said = f" (EPSG:{codes[0]} and EPSG:{codes[1]})" if all(codes) else ""
+        odd.append(f"WKT and GeoTIFF records of the CRS{said} contradict each other: some programs show the strip in "
+                   "another place, or in another unit; remove the wrong ones")  # fmt: skip
     values = {entry.name: getattr(checked, entry.name) for entry in fields(checked)}
     values["warnings"] = (*checked.warnings, *odd, *place.warnings)
     return StripFacts(**values, digitizers=digitizers, compression=compression, packets=place,
