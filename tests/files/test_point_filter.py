@@ -8,7 +8,7 @@ import pytest
 from commands import refuses
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.point_filter import EVERY, REASONS, PointFilter, check_bbox
+from wavebatch.files.cloud.point_filter import EVERY, TESTS, PointFilter, check_bbox
 from wavebatch.files.geojson import Polygon, find_inside
 
 ROWS = {
@@ -34,7 +34,7 @@ def plan(chosen, *lacks):
 
 
 def reasons(chosen):
-    return [("", *REASONS)[number] for number in plan(chosen).test(ROWS, 6).tolist()]
+    return [("", *TESTS)[number] for number in plan(chosen).test(ROWS, 6).tolist()]
 
 
 @pytest.mark.parametrize(

@@ -328,7 +328,7 @@ def test_error_of_a_root_mean_square_is_what_repetitions_show(rng):
     stated = np.mean([figure.error for figure in drawn])
     assert scatter < 1.07 * stated and stated < 2.0 * scatter
     assert np.mean([figure.value for figure in drawn]) == pytest.approx(3, rel=0.01)
-    assert accuracy.root_mean_square(np.zeros(9), np.arange(9), np.zeros(9, int)) == accuracy.Figure(0.0, 0.0)
+    assert accuracy.root_mean_square(np.zeros(9), np.arange(9), np.zeros(9, int)) == accuracy.Estimate(0.0, 0.0)
     steady = accuracy.root_mean_square(np.ones(100), np.arange(100), np.arange(100) % 8)
     one_off_by_ten, surveys = np.sqrt(2) - 1, np.sqrt(2 / 8) * accuracy.SURVEY_SCATTER
     assert steady.value == 1 and steady.error == pytest.approx(np.hypot(one_off_by_ten, surveys))

@@ -26,7 +26,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
+from wavebatch.files.cloud.point_filter import TESTS, PlannedFilter
 from wavebatch.files.cloud.writer import OutputLayout
 from wavebatch.files.disk.raw_bytes import naming, undoing
 from wavebatch.files.disk.temp_store import RowParcel
@@ -280,8 +280,8 @@ def finish_rows(
     start = Seconds.now()
     codes = prepared.selection.test(UnitRows(rows, columns), len(rows))
     kept = codes == 0
-    numbers = dict(zip(("", *REASONS), np.bincount(codes, minlength=len(REASONS) + 1).tolist(), strict=True))
-    number, total = split_numbers(rows[codes == len(REASONS)])
+    numbers = dict(zip(("", *TESTS), np.bincount(codes, minlength=len(TESTS) + 1).tolist(), strict=True))
+    number, total = split_numbers(rows[codes == 1 + TESTS.index("where")])
     left = RunReport(
         counts={"points_out": numbers[""]},
         last_left_out=int(np.count_nonzero(number == total)),
@@ -394,7 +394,7 @@ def _block_size(unit: Unit, wanted: int | None) -> int:
     return most if wanted is None else min(most, max(wanted * USUAL_SAMPLES // longest, 1), wanted)
 
 
-Part = tuple[RowParcel, int, int]
+RowSpan = tuple[RowParcel, int, int]
 """Rows [start, stop) of a unit."""
 
 
@@ -402,7 +402,7 @@ class Packing:
     """The rows of one strip that are not written yet: `add` those of all units in order, `take` a chunk when it may."""
 
     def __init__(self) -> None:
-        self._parts: deque[Part] = deque()
+        self._parts: deque[RowSpan] = deque()
         self._count = 0
         """Rows that are in no chunk yet."""
         self._open: deque[list[RowParcel]] = deque()
@@ -422,7 +422,7 @@ class Packing:
         """Whether all rows are written."""
         return not self._count + len(self._open)
 
-    def next_chunk(self) -> list[Part]:
+    def next_chunk(self) -> list[RowSpan]:
         """Return the rows of the next chunk, for `pack_chunk`."""
         parts, ended, left = [], [], min(self._count, CHUNK_POINTS)
         self._count -= left
@@ -449,14 +449,14 @@ class Packing:
             rows.close()
 
 
-def pack_chunk(path: Path, parts: list[Part], point_format: int) -> tuple[Chunk, Seconds]:
+def pack_chunk(path: Path, parts: list[RowSpan], point_format: int) -> tuple[Chunk, Seconds]:
     """Compress the rows of one LAZ chunk.
 
     Parameters
     ----------
     path : Path
         Of the strip, for messages.
-    parts : list of Part
+    parts : list of RowSpan
     point_format : int
         Of the cloud.
 

@@ -269,9 +269,9 @@ def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request
     system = choice.survey.system
     if request.describe() is not None or (len(system.components) < 2 and not system.kappa):
         return choice
-    from wavebatch.surveying.predict_error import WAVEFORMS, leave_out_false, predict_errors
+    from wavebatch.surveying.predict_error import TRIAL_WAVEFORMS, leave_out_false, predict_errors
 
-    sample = join_digitizers(read_sample(reader, scan, WAVEFORMS))
+    sample = join_digitizers(read_sample(reader, scan, TRIAL_WAVEFORMS))
     if not sample:
         return choice
     chains = {_USERS: choice.chain, COSTS[-1]: load_profile(COSTS[-1])}

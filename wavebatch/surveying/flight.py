@@ -25,7 +25,7 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.choose_chain import decide
 from wavebatch.surveying.inspect_strip import doubt_files
 from wavebatch.surveying.look import (
-    HELD,
+    COMPARED,
     Glance,
     compare_echoes,
     compare_looks,
@@ -173,7 +173,7 @@ def _read_sample(
         with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
             size = reader.sample_size(scan)
             share = max(-(-(waveforms or size) // strips), 1 if waveforms else LEAST_SHARE)
-            held = 0 if waveforms or strips * min(HELD, size) > ROOM * size else min(HELD, size)
+            held = 0 if waveforms or strips * min(COMPARED, size) > ROOM * size else min(COMPARED, size)
             blocks = tuple(reader.sample_blocks(scan, max(share, held)))
             warnings = [asdict(one) for one in doubt_files(reader.facts, scan)]
             facts = {"points": scan.points, "packets": scan.packets, "warnings": warnings}
@@ -241,7 +241,7 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     compared = {
         sample.path
         for sample, strip in zip(samples, held, strict=True)
-        if strip.fits and strip.look is not None and strip.look.width and sum(map(len, sample.blocks)) >= HELD
+        if strip.fits and strip.look is not None and strip.look.width and sum(map(len, sample.blocks)) >= COMPARED
     }
     identity = {"strips": [{**sample.fingerprint, "compared": sample.path in compared} for sample in group]}
     name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
@@ -274,7 +274,7 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str
     surveyed = flight.fingerprint.get("strips")
     if isinstance(surveyed, list) and {**fingerprint, "compared": True} in surveyed:
         return ""
-    number = min(HELD, reader.sample_size(scan))
+    number = min(COMPARED, reader.sample_size(scan))
     sample = StripSample(reader.facts.path, fingerprint, tuple(reader.sample_blocks(scan, number)))
     return _hold((sample, None), flight.survey.system, whole, kinds).reason if sample.blocks else ""
 

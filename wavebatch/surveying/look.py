@@ -312,7 +312,7 @@ def surveys_agree(surveys: Sequence[Survey]) -> bool:
     return True
 
 
-HELD = 512
+COMPARED = 512
 """Waveforms of a strip that are compared with a survey, also with that of its flight. Their width scatters by 0.6 %,
 far less than NARROWER and WIDER, and each 100 take 2 to 6 ms."""
 
@@ -404,7 +404,7 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     sure : bool
         Whether no scene of the survey's sensor can explain it.
     """
-    blocks = tuple(reader.sample_blocks(scan, min(HELD, reader.sample_size(scan))))
+    blocks = tuple(reader.sample_blocks(scan, min(COMPARED, reader.sample_size(scan))))
     if not blocks:
         return "", False
     figures = survey.figures

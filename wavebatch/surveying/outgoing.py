@@ -21,7 +21,7 @@ from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.survey_result import Decision, SavedSurvey, Survey, load_survey
 
-STACKED = 4096
+MOST_STACKED = 4096
 """Outgoing pulses that are stacked, at most."""
 REACH = (6.0, 12.0)
 """Widths before and after the peak that the stack covers."""

@@ -29,7 +29,7 @@ from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.measuring.residuals import decompose_sample, render_own
 
-WAVEFORMS = 2048
+TRIAL_WAVEFORMS = 2048
 """Waveforms of a trial."""
 
 SEED = 20071
@@ -92,7 +92,7 @@ def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[st
     the echoes that a chain finds there are compared with them. Targets so close that they were one echo in the sample
     are one target here: the error is that of echoes that can be resolved.
     """
-    block = block.rows(slice(0, None, max(len(block) // WAVEFORMS, 1)))
+    block = block.rows(slice(0, None, max(len(block) // TRIAL_WAVEFORMS, 1)))
     noise = pooled(block, system)
     truth = adaptive(block, noise, system, maximum(block, noise, system))
     sure = truth.amplitude >= LEAST_SNR * noise.std[truth.waveform]

@@ -23,8 +23,8 @@ from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse, measure_skew
 from wavebatch.surveying.measuring.misfit import (
     LEAST_MISFIT,
+    MISFIT_PEAK,
     MOST_FAINT,
-    PEAK,
     cover_fits,
     cover_repeated,
     find_parts,
@@ -207,7 +207,7 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool, err
     other = replace(system, noise=measured.noise, saturation=measured.saturation)
     # The main one's pulse, but what echoes must exceed beside strong ones follows from this one's noise too.
     echoes = decompose_sample(block, other)
-    return limit_faint(replace(other, faint_share=MOST_FAINT), system.faint_share / PEAK, echoes)
+    return limit_faint(replace(other, faint_share=MOST_FAINT), system.faint_share / MISFIT_PEAK, echoes)
 
 
 def survey_block(block: WaveformBlock, *, learn: bool = True, errors: bool = True) -> Survey:

@@ -322,11 +322,11 @@ _RANKS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
 """Ranks of the two values whose mean is the statistic, from the counts of cells."""
 
 
-HELD = 2_000_000
+HELD_POINTS = 2_000_000
 """Points in memory at a time."""
 
 MOST_BUCKETS = 4096
-"""With HELD / 2 points each they hold 4e9 points."""
+"""With HELD_POINTS / 2 points each they hold 4e9 points."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -349,7 +349,7 @@ number of cells to bands f8 (m, cells)."""
 
 def compute_tiles(
     clouds: Clouds, statistic: Statistic, grid: Grid, points: int, result: Placed, bounds: Box | None = None,
-    *, held: int = HELD,
+    *, held: int = HELD_POINTS,
 ) -> Iterator[tuple[int, int, np.ndarray]]:
     """Row from the north, column and values f8 (bands, TILE, TILE) of every tile with a point; NaN without a value.
 
@@ -486,7 +486,7 @@ def grid_values(
     *,
     size: float | None = None,
     bounds: Box | None = None,
-    held: int = HELD,
+    held: int = HELD_POINTS,
 ) -> Raster:
     """The map of a column of clouds; medians of large clouds need room in TMPDIR.
 

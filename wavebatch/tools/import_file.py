@@ -39,7 +39,7 @@ from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference, measure_outgoing
 from wavebatch.kernels.signal.signal import find_peaks, smooth_121, transpose_samples
 from wavebatch.surveying.measuring.noise_and_width import find_saturation
-from wavebatch.surveying.outgoing import STACKED, SYSTEM_SUFFIX, OutgoingShape, learn_shape, save_outgoing
+from wavebatch.surveying.outgoing import MOST_STACKED, SYSTEM_SUFFIX, OutgoingShape, learn_shape, save_outgoing
 from wavebatch.surveying.systems.survey_result import format_survey
 
 SUFFIXES = (".pls",)
@@ -220,7 +220,7 @@ def import_file(
 
 MOST_DESCRIPTORS = 250
 """Wave packet descriptors that a strip gets: LAS has 255. With more lengths, lengths are rounded up."""
-SAMPLED = 2 * STACKED
+SAMPLED = 2 * MOST_STACKED
 """Pulses of the sample, about."""
 ONE_TIME = 64
 """Pulses of one time from which that is no time."""

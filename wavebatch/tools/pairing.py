@@ -32,7 +32,7 @@ from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
 from wavebatch.tools.return_stats import pulses_told_apart
 from wavebatch.tools.simulate.strip import TruthReader
 
-Table = dict[str, tuple[int, int]]
+ClassCounts = dict[str, tuple[int, int]]
 """Per class: echoes without a partner, and all echoes."""
 
 
@@ -73,10 +73,10 @@ class Comparison:
 
     `time` is the error of the position; `echo_time`, if the cloud has it, the error of the fit alone.
     Medians and errors of more than a million pairs come from an even sample."""
-    missed_by: dict[str, Table] = field(default_factory=dict)
+    missed_by: dict[str, ClassCounts] = field(default_factory=dict)
     """Missed echoes by kind (return, class, amplitude or intensity, pulse, flag) and name: number missed, number in b.
     An echo counts for each of its flags. Intensity is used if b has no amplitudes."""
-    extra_by: dict[str, Table] = field(default_factory=dict)
+    extra_by: dict[str, ClassCounts] = field(default_factory=dict)
     """Extra echoes, as `missed_by`."""
     left_out_a: int = 0
     """Points of a that do not meet the condition of --where; they are not compared."""
@@ -561,7 +561,7 @@ class Breakdown:
         tally[:, 0] += np.bincount(code[alone], minlength=len(tally))
         tally[:, 1] += np.bincount(code, minlength=len(tally))
 
-    def tables(self) -> dict[str, Table]:
+    def tables(self) -> dict[str, ClassCounts]:
         """For each kind the classes that have an echo; kinds without data are left out.
 
         `intensity` is there only without amplitudes and if not all are 0; `flag` and `class` only if any echo has one.

@@ -334,7 +334,7 @@ class GridResult(cells.Placed):
 
 
 def write_grid(
-    paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False, held: int = cells.HELD
+    paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False, held: int = cells.HELD_POINTS
 ) -> GridResult:
     """Write the raster; held: points in memory at a time.
 

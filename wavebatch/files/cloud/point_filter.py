@@ -25,8 +25,8 @@ from wavebatch.files.las.header import LasHeader
 if TYPE_CHECKING:
     from wavebatch.files.geojson import Polygon
 
-REASONS = ("drop_flags", "flags", "classes", "bbox", "polygon", "where")
-"""Why a point is left out, in the order of the tests: it counts for the first one that it does not meet."""
+TESTS = ("drop_flags", "flags", "classes", "bbox", "polygon", "where")
+"""The tests in their order: a point that is left out counts for the first one that it does not meet."""
 
 ReadColumn = Callable[[Any], np.ndarray]
 """Gives the values (n,) of a column from rows, NaN for no data."""
@@ -205,11 +205,11 @@ class PlannedFilter:
         Returns
         -------
         int8 (n,)
-            0 for rows that are used; for the others the number of the reason in REASONS, from 1.
+            0 for rows that are used; for the others the number of the test in TESTS, from 1.
         """
         left = np.zeros(n, np.int8)
         for reason, meets in self._test(rows):
-            left[(left == 0) & ~meets] = 1 + REASONS.index(reason)
+            left[(left == 0) & ~meets] = 1 + TESTS.index(reason)
         return left
 
     def _test(self, rows: Any) -> Iterator[tuple[str, np.ndarray]]:

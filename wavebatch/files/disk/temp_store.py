@@ -349,7 +349,7 @@ class RowStore:
         self._draft.discard()
 
 
-HELD = 1 << 18
+HELD_ROWS = 1 << 18
 """Rows in memory before they are sorted and written to disk."""
 
 STRIDE = 256
@@ -363,7 +363,7 @@ class KeyedSums(Closing):
     A context manager.
     """
 
-    def __init__(self, columns: int, *, held: int = HELD, stride: int = STRIDE) -> None:
+    def __init__(self, columns: int, *, held: int = HELD_ROWS, stride: int = STRIDE) -> None:
         self._held, self._stride = held, stride
         self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []

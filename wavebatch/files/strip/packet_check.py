@@ -43,7 +43,7 @@ from wavebatch.files.strip.packets import (
 from wavebatch.kernels.packets import FIELDS, Geometry, PacketRules, judge_packets
 from wavebatch.kernels.signal.signal import find_fill, recorded_lengths
 
-OPTIONS = ("auto", "toward", "away")
+DIRECTIONS = ("auto", "toward", "away")
 VECTORS = ("x_t", "y_t", "z_t")
 LEAST_RATIO, LARGEST_RATIO = 0.7, 1.02
 """Outside these limits the length of vectors over c/2 gives a warning; usual files have 0.96 to 1.00."""

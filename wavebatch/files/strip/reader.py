@@ -135,8 +135,8 @@ class StripReader(Closing):
         self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False,
         unit_points: int | None = None, unit_bytes: int | None = None, sizes: ScanSizes = SCAN_SIZES,
     ) -> None:  # fmt: skip
-        if direction not in packet_check.OPTIONS:
-            raise ConfigError(f"direction {direction!r}: must be one of {', '.join(packet_check.OPTIONS)}")
+        if direction not in packet_check.DIRECTIONS:
+            raise ConfigError(f"direction {direction!r}: must be one of {', '.join(packet_check.DIRECTIONS)}")
         if isinstance(path, StripFacts):
             facts = path
         else:

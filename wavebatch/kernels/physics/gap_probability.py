@@ -22,7 +22,7 @@ LEAST_SPREAD = 0.1
 LARGEST_ERROR = 0.5
 """Largest relative error of a ratio that is used: a ratio of 1 that nothing supports is off by more."""
 
-LOWEST, HIGHEST = 0.02, 50.0
+LOWEST_RATIO, HIGHEST_RATIO = 0.02, 50.0
 """Ratios that are looked for."""
 
 MODEL_ERROR = 0.03
@@ -85,7 +85,7 @@ def estimate_canopy_ratio(canopy: np.ndarray, ground: np.ndarray) -> CanopyRatio
     """
     used = (canopy >= 0) & (ground >= 0) & (canopy + ground > 0) & np.isfinite(canopy + ground)
     canopy, ground = canopy[used], ground[used]
-    found = _find_ratio(canopy, ground, np.linspace(np.log(LOWEST), np.log(HIGHEST), _STEPS))
+    found = _find_ratio(canopy, ground, np.linspace(np.log(LOWEST_RATIO), np.log(HIGHEST_RATIO), _STEPS))
     if found is None:
         return None
     part, near = np.arange(len(canopy)) * PARTS // len(canopy), found + np.linspace(-_NEAR, _NEAR, 5)

@@ -27,7 +27,7 @@ from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.las.header import read_header
 from wavebatch.surveying.calibrating import adjust_flight as adjust
 from wavebatch.surveying.calibrating.calibration_files import Target
-from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, open_source
+from wavebatch.surveying.calibrating.strip_echoes import CLEAN_ECHO, CalibrationOptions, open_source
 from wavebatch.surveying.calibrating.targets import MOST_ECHOES, build_calibration, describe_channel, measure_ranging
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, check_attenuation
 from wavebatch.surveying.matching.setting import PLACES, SCANNERS, number_channel, refuse_headings, see_channels
@@ -134,7 +134,7 @@ def read_strip(
             first, last = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
             near = lambda xyz: ((xyz[:, :2] >= first) & (xyz[:, :2] <= last)).all(axis=1)  # noqa: E731
             inside = [target.contains for target in targets]
-        parts: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in inside]
+        parts: list[list[np.ndarray]] = [[np.empty(0, CLEAN_ECHO)] for _ in inside]
         shorts = [np.empty(0, adjust.TIE)]
         for rows in source.echoes(lambda xyz: near(xyz) | ties_at(xyz)):
             for contains, some in zip(inside, parts, strict=True):

@@ -33,7 +33,7 @@ from wavebatch.surveying.matching.strip_energies import StripEnergies, take_ener
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
-ECHO = np.dtype([
+CLEAN_ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
     ("channel", "<i4"), ("time", "<f8"), ("given", "<f8"), ("amplitude", "<f4"),
 ])  # fmt: skip
@@ -122,7 +122,7 @@ class EchoSource:
         return self.reader.facts.path
 
     def echoes(self, wanted: Callable[[np.ndarray], np.ndarray]) -> Iterator[np.ndarray]:
-        """Yield arrays of ECHO.
+        """Yield arrays of CLEAN_ECHO.
 
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
@@ -187,7 +187,7 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
 
 
 def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None = None) -> np.ndarray:
-    """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO.
+    """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as CLEAN_ECHO.
 
     Clipped echoes are there too, with an infinite error of their light: a target may be too bright.
 
@@ -197,7 +197,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None
     unclean = UNCLEAN & ~EchoFlag.SATURATED | EchoFlag.UNANCHORED
     echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(unclean)) == 0)))
     clipped = (echoes.flags & np.uint16(EchoFlag.SATURATED)) != 0
-    rows = np.zeros(len(echoes), ECHO)
+    rows = np.zeros(len(echoes), CLEAN_ECHO)
     rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
     away = rows["xyz"] - np.asarray(block.sensor)[echoes.waveform]
     rows["distance"] = np.sqrt((away * away).sum(axis=1))

@@ -98,7 +98,7 @@ each other. Twelve hits of a bright sign were 1.5 % of a strip, and its second e
 ROOM = 2.5
 """Widths of the pulse within which a higher echo hides a lower one."""
 
-PEAK, ABOVE_NOISE = 4.0, 3.0
+MISFIT_PEAK, ABOVE_NOISE = 4.0, 3.0
 """Largest difference of a pulse from its model over the misfit, which is a mean over the echo; and noises that an echo
 must be high beside the strip's strongest ones, which taught the pulse."""
 
@@ -160,7 +160,7 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
     if not len(echoes):
         return system
     seen = ABOVE_NOISE * system.noise.std / max(quantile(echoes.amplitude, 0.99), 1e-9)
-    return replace(system, faint_share=min(max(PEAK * max(system.misfit, change), seen), system.faint_share))
+    return replace(system, faint_share=min(max(MISFIT_PEAK * max(system.misfit, change), seen), system.faint_share))
 
 
 def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[float, float]:
@@ -466,7 +466,7 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     return replace(system, tail_misfit=tuple(sorted(parts)))
 
 
-class Seen(NamedTuple):
+class LagShares(NamedTuple):
     """What echoes have in common at a lag, as shares of them."""
 
     number: int
@@ -506,7 +506,7 @@ class ResidualShares:
         self.share = np.where(np.isfinite(residual), share / fitted.amplitude[:, None], np.nan)
         self.noise = float(system.noise.std / median(fitted.amplitude) / np.sqrt(energy))
 
-    def look(self, place: float) -> Seen:
+    def look(self, place: float) -> LagShares:
         """What is left at this lag [widths of the pulse]: between samples, so that a part's slope is no scatter."""
         at = self.time + place * self.step
         row = np.flatnonzero((at >= 0) & (at < self.share.shape[1] - 1))
@@ -516,15 +516,15 @@ class ResidualShares:
         return summarize_shares(here[np.isfinite(here)], self.noise)
 
 
-def summarize_shares(shares: np.ndarray, noise: float) -> Seen:
+def summarize_shares(shares: np.ndarray, noise: float) -> LagShares:
     """What echoes leave at one lag, from the lowest of them: neighbours only add; noise: of one share."""
     number = len(shares)
     if not number:
-        return Seen(1, 0.0, 0.0, 0.0, 0.0, np.inf)
+        return LagShares(1, 0.0, 0.0, 0.0, 0.0, np.inf)
     lowest, low, middle, high = quantiles(shares, (*NORMAL_BELOW, 0.5, 1 - NORMAL_BELOW[1]))
     # Where the lowest quantile is that of a single echo, the next one may be close to it by chance.
     spread = max(low - lowest if NORMAL_BELOW[0] * number > 1 else (middle - lowest) / 2, noise)
-    return Seen(number, lowest, low + spread, middle, high, spread)
+    return LagShares(number, lowest, low + spread, middle, high, spread)
 
 
 def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:

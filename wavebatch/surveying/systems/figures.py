@@ -32,7 +32,7 @@ MOST_FIGURE = 1e30
 
 Figure = Annotated[float | None, Range(-MOST_FIGURE, MOST_FIGURE), Key()]
 Share = Annotated[float | None, Range(0.0, 1.0), Key()]
-Scene = Annotated[float | None, Range(-MOST_FIGURE, MOST_FIGURE), Key(averaged=True)]
+SceneFigure = Annotated[float | None, Range(-MOST_FIGURE, MOST_FIGURE), Key(averaged=True)]
 """Of the scene, which all digitizers of a strip see."""
 SceneShare = Annotated[float | None, Range(0.0, 1.0), Key(averaged=True)]
 Number = Annotated[float, Range(-MOST_FIGURE, MOST_FIGURE), Key()]
@@ -119,7 +119,7 @@ class Figures:
     """Of the waveforms; so are the next two."""
     single_share: SceneShare = None
     overlapped_share: SceneShare = None
-    echoes_per_waveform: Scene = None
+    echoes_per_waveform: SceneFigure = None
     amplitude_50: Figure = None
     amplitude_99: Annotated[Figure, Key(shown="amplitudes: 99 % below {:.1f} DN")] = None
     saturated_share: SceneShare = None

@@ -37,7 +37,7 @@ OUTLIER = 10.0
 
 
 @frozen
-class Figure:
+class Estimate:
     """A value and its error: the standard error of the difference between two runs that differ in their seed.
 
     That is 1.41 times the standard error of the value, which is the larger of two estimates: from the scatter of single
@@ -52,38 +52,38 @@ class Figure:
         return without_nan(asdict(self))
 
 
-def share_figure(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
+def share_figure(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Estimate:
     """Sum of `part` over that of `whole`, counts per waveform (n,) in groups (n,), as a figure.
 
     Shares near 0 or 1 keep the error that two counts more or less would make (Agresti and Coull 1998).
     """
     total = float(whole.sum())
     if not total:
-        return Figure()
+        return Estimate()
     value = float(part.sum()) / total
     error = _standard_error((part - value * whole) / total, group)
     drawn = (total * value + 2) / (total + 4)
-    return Figure(value, float(np.sqrt(2) * max(error, np.sqrt(drawn * (1 - drawn) / (total + 4)))))
+    return Estimate(value, float(np.sqrt(2) * max(error, np.sqrt(drawn * (1 - drawn) / (total + 4)))))
 
 
-def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray) -> Figure:
+def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray) -> Estimate:
     """Root mean square of values (m,) of echoes of the given waveforms (m,), unique over all groups, as a figure.
 
     The error includes the scatter of surveys, and one more echo OUTLIER times as bad as the others.
     """
     if len(values) < 2:
-        return Figure()
+        return Estimate()
     squares = np.square(values.astype(np.float64))
     mean = float(squares.mean())
     if not mean:
-        return Figure(0.0, 0.0)
+        return Estimate(0.0, 0.0)
     influence = (squares - mean) / (2 * np.sqrt(mean) * len(squares))
     _, place, where = np.unique(waveform, return_index=True, return_inverse=True)
     per_waveform = np.bincount(where, influence)
     error = _standard_error(per_waveform, group[place])
     rare = np.sqrt(mean) * (np.sqrt(1 + OUTLIER**2 / len(squares)) - 1)
     surveys = SURVEY_SCATTER * np.sqrt(mean / len(np.unique(group)))
-    return Figure(float(np.sqrt(mean)), float(np.hypot(np.sqrt(2) * max(error, surveys), rare)))
+    return Estimate(float(np.sqrt(mean)), float(np.hypot(np.sqrt(2) * max(error, surveys), rare)))
 
 
 def _standard_error(influence: np.ndarray, group: np.ndarray) -> float:
@@ -348,7 +348,7 @@ class AccuracyTally:
         self._echoes.append(part)
         self.waveforms += n
 
-    def figures(self) -> dict[str, Figure]:
+    def figures(self) -> dict[str, Estimate]:
         """Every figure by name: shares as fractions, lengths in cm of range, the others without unit."""
         w, e = ({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
                 for parts in (self._waveforms, self._echoes))  # fmt: skip
@@ -367,7 +367,7 @@ class AccuracyTally:
         every = np.ones(len(e["time"]), bool)
         for kind, rows in (("all", every), ("isolated", e["isolated"]), ("overlapped", ~e["isolated"])):
             found_ns = _spread(e, "time", rows)
-            figures[f"rmse_{kind}_cm"] = Figure(found_ns.value * CM_PER_NS, found_ns.error * CM_PER_NS)
+            figures[f"rmse_{kind}_cm"] = Estimate(found_ns.value * CM_PER_NS, found_ns.error * CM_PER_NS)
             if kind == "all":
                 continue
             clear = rows & e["clear"]
@@ -386,5 +386,5 @@ class AccuracyTally:
         return figures
 
 
-def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray) -> Figure:
+def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray) -> Estimate:
     return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows])

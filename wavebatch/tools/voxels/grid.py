@@ -28,7 +28,7 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.npz import NpzWriter, read_npz, reading_npz
 from wavebatch.files.disk.publish import Draft, protecting, publish_together
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.disk.temp_store import HELD, KeyedSums
+from wavebatch.files.disk.temp_store import HELD_ROWS, KeyedSums
 from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import name_crs, repair_records, repair_wkt
 from wavebatch.files.las.write_points import PointFile
@@ -105,7 +105,7 @@ class VoxelGrid(Closing):
         sections: bool,
         everything: bool,
         floor: Floor | None = None,
-        held: int = HELD,
+        held: int = HELD_ROWS,
     ) -> None:
         self.size, self.anchor = size, anchor
         self.columns = tuple(column for column in COLUMNS if sections or column.name != "cross_section")

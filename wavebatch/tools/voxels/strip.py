@@ -26,12 +26,12 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
-from wavebatch.files.disk.temp_store import HELD
+from wavebatch.files.disk.temp_store import HELD_ROWS
 from wavebatch.files.las.header import locate, split_numbers
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
-from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
+from wavebatch.kernels.physics.gap_probability import HIGHEST_RATIO, LOWEST_RATIO
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request, widest_chain
@@ -91,7 +91,7 @@ class VoxelOptions(CheckedOptions):
     ground_height: Annotated[float, Range(0.0, 100.0)] = option(
         0.5, "Height above the lowest returns up to which signal counts as ground [m].", form="M"
     )
-    reflectance_ratio: Annotated[float | None, Range(LOWEST, HIGHEST)] = option(
+    reflectance_ratio: Annotated[float | None, Range(LOWEST_RATIO, HIGHEST_RATIO)] = option(
         None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
     )
     selection: PointFilter = PointFilter()
@@ -182,7 +182,7 @@ def voxelize_strip(
     profiles: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
     block_size: int | None = None,
-    held: int = HELD,
+    held: int = HELD_ROWS,
     unit_points: int | None = None,
 ) -> VoxelSummary:
     """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
