@@ -54,7 +54,7 @@ def draw_parts(seed, spread, number=40):
 @pytest.mark.parametrize(("seed", "stride"), [(1, 256), (2, 4), (3, 1)])
 def test_sums_are_those_of_a_dictionary(held, spread, seed, stride):
     parts = draw_parts(seed, spread, 40 if held > 3 else 6)
-    with temp_store.KeyedSums(3, held=held, stride=stride) as sums:
+    with temp_store.KeyedSums(3, in_memory=held, stride=stride) as sums:
         for key, value in parts:
             sums.add(key, value)
         pieces = list(sums.pieces())
@@ -67,7 +67,7 @@ def test_sums_are_those_of_a_dictionary(held, spread, seed, stride):
 
 
 def test_pieces_of_many_runs_are_small():
-    with temp_store.KeyedSums(3, held=400, stride=8) as sums:
+    with temp_store.KeyedSums(3, in_memory=400, stride=8) as sums:
         for key, value in draw_parts(5, 2**23, 400):
             sums.add(key, value)
         runs = len(sums._runs)
@@ -76,7 +76,7 @@ def test_pieces_of_many_runs_are_small():
 
 
 def test_without_a_place_sums_say_so(no_place):
-    with temp_store.KeyedSums(3, held=10) as sums, pytest.raises(InputError, match="TMPDIR"):
+    with temp_store.KeyedSums(3, in_memory=10) as sums, pytest.raises(InputError, match="TMPDIR"):
         for key, value in draw_parts(4, 1000):
             sums.add(key, value)
 

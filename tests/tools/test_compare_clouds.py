@@ -74,7 +74,7 @@ def test_time_zero_is_one_pulse_whatever_its_sign(tmp_path, held):
     times -= times[0]
     write_cloud(tmp_path / "a.las", times, xyz)
     write_cloud(tmp_path / "b.las", np.where(times == 0, -0.0, times), xyz)
-    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", held=held)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", in_memory=held)
     assert result.matched_by == "gps_time" and result.missed == result.extra == 0
 
 
@@ -96,7 +96,7 @@ def test_without_useful_times_nearest_neighbours_are_matched(tmp_path, times_are
     given = {"missing": None, "zero": np.zeros(len(times)), "of another day": times + 86400}[times_are]
     write_cloud(tmp_path / "a.las", given, xyz + 0.3 * AIR_SPEED * ray, point_format=0 if given is None else 6)
     write_cloud(tmp_path / "b.las", times[:-20], xyz[:-20])
-    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", held=1500)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", in_memory=1500)
     assert result.matched_by == "position"
     # Rays cross here and there: a handful of points have a stranger as their nearest neighbour.
     assert len(times) - 20 >= result.matched > len(times) - 25
@@ -173,7 +173,7 @@ def test_vendor_returns_against_truth_and_against_the_result(strip):
     assert both.missed <= 3
     assert both.extra == pytest.approx(vendor.missed, abs=5)
     assert abs(both.differences["time"].median) < 0.01
-    parts = compare_truth(folder / "s.laz", folder / "t.npz", held=500)
+    parts = compare_truth(folder / "s.laz", folder / "t.npz", in_memory=500)
     assert parts.matched == vendor.matched
     assert parts.errors["isolated"]["time"].number == truth["isolated"].sum()
 
@@ -271,7 +271,7 @@ def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatc
         cloud.intensity = np.full(these.sum(), 9)
         cloud.classification = kinds[these]
         cloud.write(tmp_path / name)
-    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", held=900)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", in_memory=900)
     missed, extra = far | ~keep, far & keep
     naive = {"return": {}, "amplitude": {}, "flag": {}, "class": {}}
     names = {1: "1 unclassified", 2: "2 ground", 5: "5 high vegetation", 64: "64"}

@@ -33,12 +33,12 @@ def voxelize(strip, target, ratio=None):
     return target
 
 
-def measure(voxels, folder, size=CELL, box=(0.0, 0.0, SIDE, SIDE), held=2_000_000, **options):
+def measure(voxels, folder, size=CELL, box=(0.0, 0.0, SIDE, SIDE), in_memory=2_000_000, **options):
     """The result, and each band by its name, rows from the north."""
     rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     paths = voxels if isinstance(voxels, list) else [voxels]
     how = GridOptions(size=size, bbox=box, no_data=np.nan, forest=ForestOptions(**options))
-    result = write_grid(paths, folder / "f.tif", how, overwrite=True, held=held)
+    result = write_grid(paths, folder / "f.tif", how, overwrite=True, in_memory=in_memory)
     with rasterio.open(folder / "f.tif") as file:
         assert set(file.dtypes) == {"float32"} and file.tags()["LEAF_PROJECTION"] == f"{how.forest.leaf_projection:g}"
         return result, dict(zip(file.descriptions, file.read().astype(float), strict=True))
@@ -167,7 +167,7 @@ def test_leaves_that_show_more_of_themselves_are_fewer(even, tmp_path):
 def test_cells_do_not_depend_on_memory_and_twice_the_same_voxels_are_the_same(even, tmp_path):
     _, once = measure(even[1], tmp_path)
     _, twice = measure([even[1], even[1]], tmp_path)
-    _, parts = measure(even[1], tmp_path, held=3000)
+    _, parts = measure(even[1], tmp_path, in_memory=3000)
     for name, band in once.items():
         np.testing.assert_array_equal(parts[name], band)
         if "err" not in name:

@@ -100,7 +100,7 @@ def test_tiles_do_not_depend_on_the_points_in_memory(rng, tmp_path, held, size):
     """64: more buckets than tiles, and buckets that do not fit, tile by tile in groups of cells."""
     _cloud(tmp_path / "a.las", rng)
     for statistic in ("median", "mean", "max", "count"):
-        whole, parts = (grid_values([tmp_path / "a.las"], "height", statistic, size=size, held=most).values
+        whole, parts = (grid_values([tmp_path / "a.las"], "height", statistic, size=size, in_memory=most).values
                         for most in (2_000_000, held))  # fmt: skip
         np.testing.assert_array_equal(parts, whole)
 

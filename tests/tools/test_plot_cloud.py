@@ -285,7 +285,7 @@ def test_flags_select_and_are_counted(cloud):
 
 @pytest.mark.parametrize("statistic", ["mean", "median", "min", "max", "count", "density"])
 def test_map_is_that_of_a_loop_over_cells(cloud, statistic):
-    found = grid_values([cloud], "amplitude", statistic, size=2.5, held=700)
+    found = grid_values([cloud], "amplitude", statistic, size=2.5, in_memory=700)
     x, y, amplitude, _ = read_plainly(cloud)
     grid = found.grid
     west, _, south, _ = grid.extent

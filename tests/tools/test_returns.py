@@ -58,7 +58,7 @@ def check_small(found, by):
 def test_small_cloud_is_counted_by_times_or_rising_numbers(tmp_path, point_format, by):
     path = write_cloud(tmp_path / "c.las", **SMALL, point_format=point_format)
     for held in (400_000, 2):
-        each, total = count_returns([path], held=held)
+        each, total = count_returns([path], in_memory=held)
         check_small(each[0], by)
         check_small(total, by)
     assert each[0].flags is None
@@ -73,7 +73,7 @@ def test_points_without_a_time_are_not_one_pulse(tmp_path, missing):
     (found,), _ = count_returns([write_cloud(tmp_path / "a.las", **parts)])
     assert (found.pulses, found.pulses_by) == (40, "gps_time") and found.by_count[3] == pytest.approx(0.25)
     assert found.warnings[0].startswith("points without GPS time (0 or NaN): 30;")
-    (again,), _ = count_returns([tmp_path / "a.las"], held=5)
+    (again,), _ = count_returns([tmp_path / "a.las"], in_memory=5)
     assert (again.by_count, again.warnings) == (found.by_count, found.warnings)
 
 
@@ -287,7 +287,7 @@ def check_sum(areas, total):
 @pytest.mark.parametrize("held", [400_000, 150])
 def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, size, held):
     points = make_cloud(tmp_path / "c.las")
-    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(size)], held=held)
+    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(size)], in_memory=held)
     naive = count_naively(*points, lambda x, y: (math.floor(x / size) * size, math.floor(y / size) * size))
     check_areas(one.areas, naive, lambda area: (area.x, area.y))
     check_sum(one.areas, one)

@@ -354,7 +354,7 @@ def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target):
                "deconvolution": QUICK}  # fmt: skip
     made = set()
     for block_size, held in ((None, 400_000), (97, 1 << 20), (600, 500), (1500, 3)):
-        voxelize(strip, tmp_path / target, 0.8, block_size=block_size, held=held, **options)
+        voxelize(strip, tmp_path / target, 0.8, block_size=block_size, in_memory=held, **options)
         made.add((tmp_path / target).read_bytes() + (tmp_path / "p.npz").read_bytes())
     assert len(made) == 1
 
@@ -713,7 +713,7 @@ def test_the_strip_may_be_in_any_order_and_cut_anywhere(strips, canopy, tmp_path
     expected = voxelize_pulses(strips[1], tmp_path, profiles=tmp_path / "a.npz")[1]
     made = [(tmp_path / name).read_bytes() for name in ("v.npz", "a.npz")]
     for block_size, held in ((40, 1 << 18), (97, 400)):
-        voxelize_pulses(strips[1], tmp_path, block_size=block_size, held=held, profiles=tmp_path / "a.npz")
+        voxelize_pulses(strips[1], tmp_path, block_size=block_size, in_memory=held, profiles=tmp_path / "a.npz")
         assert [(tmp_path / name).read_bytes() for name in ("v.npz", "a.npz")] == made
     mixed = write_recorded(
         tmp_path / "mixed.las", *pulses, record(canopy[0], 4),

@@ -321,14 +321,14 @@ def _gather(blob: bytes, number: int) -> normals.Surroundings:
     task: TileTask = unpack(blob)
     radius = task.step.effective()["radius"]
     kept = np.empty(0, ENTRY)
-    held: list[np.ndarray] = []
+    waiting: list[np.ndarray] = []
     for piece in itertools.chain(task.entries.pieces(number), [None]):
         if piece is not None:
-            held.append(piece)
-        if held and (piece is None or sum(map(len, held)) >= task.part_points):
-            kept = np.concatenate([kept, *held])
+            waiting.append(piece)
+        if waiting and (piece is None or sum(map(len, waiting)) >= task.part_points):
+            kept = np.concatenate([kept, *waiting])
             kept = kept[normals.thin_out(task.place(kept["xyz"]), kept["row"], radius)]
-            held = []
+            waiting = []
     return normals.Surroundings(task.place(kept["xyz"]))
 
 

@@ -43,7 +43,7 @@ class _State:
     """Signals so far."""
     raised = -_PAUSE
     """Time of the last KeyboardInterrupt [s]."""
-    held = 0
+    depth = 0
     """Depth of `uninterrupted`: above 0, signals are only counted."""
 
 
@@ -66,14 +66,14 @@ def uninterrupted() -> Iterator[None]:
         yield
         return
     alone = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a program that calls the library
-    depth = _State.held
+    depth = _State.depth
     try:
         if alone:
             signal.signal(signal.SIGINT, _handle)
-        _State.held += 1
+        _State.depth += 1
         yield
     finally:
-        _State.held = depth
+        _State.depth = depth
         try:
             if not depth:
                 check()
@@ -93,7 +93,7 @@ def guard(command: Callable[[], Any]) -> None:
             _handle_with(_handle, signal.SIG_IGN)
             command()
         finally:
-            _State.held += 1
+            _State.depth += 1
     except BaseException as caught:
         error = caught
     _handle_with(signal.SIG_IGN)
@@ -122,7 +122,7 @@ def _handle(number: int, frame: object) -> None:
     now = time.monotonic()
     repeated = _State.arrived and now - _State.raised < _PAUSE
     _State.arrived += 1
-    if not _State.held and not repeated:
+    if not _State.depth and not repeated:
         _State.raised = now
         raise _Interrupt
 

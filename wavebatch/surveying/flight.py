@@ -173,8 +173,8 @@ def _read_sample(
         with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
             size = reader.sample_size(scan)
             share = max(-(-(waveforms or size) // strips), 1 if waveforms else LEAST_SHARE)
-            held = 0 if waveforms or strips * min(COMPARED, size) > ROOM * size else min(COMPARED, size)
-            blocks = tuple(reader.sample_blocks(scan, max(share, held)))
+            least = 0 if waveforms or strips * min(COMPARED, size) > ROOM * size else min(COMPARED, size)
+            blocks = tuple(reader.sample_blocks(scan, max(share, least)))
             warnings = [asdict(one) for one in doubt_files(reader.facts, scan)]
             facts = {"points": scan.points, "packets": scan.packets, "warnings": warnings}
             fingerprint = take_fingerprint(path, reader.facts.packets.file)
@@ -182,7 +182,7 @@ def _read_sample(
             raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
     except InputError as error:
         return error
-    return StripSample(path, fingerprint, blocks, facts, share if share < held else None)
+    return StripSample(path, fingerprint, blocks, facts, share if share < least else None)
 
 
 def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Flight:
@@ -230,8 +230,8 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
         survey = replace(survey, decisions=decide(survey))
         whole = look_at(blocks, survey.system)
         hold = functools.partial(_hold, system=survey.system, whole=whole, kinds=kinds)
-        held = list(spread(hold, [(sample, seen.get(sample.path)) for sample in samples]))
-        fitting = [sample for sample, strip in zip(samples, held, strict=True) if strip.fits]
+        judged = list(spread(hold, [(sample, seen.get(sample.path)) for sample in samples]))
+        fitting = [sample for sample, strip in zip(samples, judged, strict=True) if strip.fits]
         if not fitting or fitting == group:
             break
         group = fitting
@@ -240,12 +240,12 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     # Of 64 waveforms the clip level is seldom seen, and widths are known to no 6 %: strangers over roofs passed.
     compared = {
         sample.path
-        for sample, strip in zip(samples, held, strict=True)
+        for sample, strip in zip(samples, judged, strict=True)
         if strip.fits and strip.look is not None and strip.look.width and sum(map(len, sample.blocks)) >= COMPARED
     }
     identity = {"strips": [{**sample.fingerprint, "compared": sample.path in compared} for sample in group]}
     name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
-    return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(held))
+    return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(judged))
 
 
 def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str:

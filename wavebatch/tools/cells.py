@@ -322,11 +322,11 @@ _RANKS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
 """Ranks of the two values whose mean is the statistic, from the counts of cells."""
 
 
-HELD_POINTS = 2_000_000
+POINTS_IN_MEMORY = 2_000_000
 """Points in memory at a time."""
 
 MOST_BUCKETS = 4096
-"""With HELD_POINTS / 2 points each they hold 4e9 points."""
+"""With POINTS_IN_MEMORY / 2 points each they hold 4e9 points."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -349,15 +349,15 @@ number of cells to bands f8 (m, cells)."""
 
 def compute_tiles(
     clouds: Clouds, statistic: Statistic, grid: Grid, points: int, result: Placed, bounds: Box | None = None,
-    *, held: int = HELD_POINTS,
+    *, in_memory: int = POINTS_IN_MEMORY,
 ) -> Iterator[tuple[int, int, np.ndarray]]:
     """Row from the north, column and values f8 (bands, TILE, TILE) of every tile with a point; NaN without a value.
 
     There is a band for each column of the clouds, or those that the statistic computes. points: of all clouds, about.
-    result: gets the counts before the first tile comes. bounds: only points within them count. held: points in memory
-    at a time.
+    result: gets the counts before the first tile comes. bounds: only points within them count. in_memory: points at a
+    time.
     """
-    number, across = int(np.clip(-(-points // (held // 2)), 1, MOST_BUCKETS)), -(-grid.columns // TILE)
+    number, across = int(np.clip(-(-points // (in_memory // 2)), 1, MOST_BUCKETS)), -(-grid.columns // TILE)
     entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (len(clouds.every),))]))
     try:
         # Every point with a value goes into the bucket of its tile.
@@ -380,7 +380,7 @@ def compute_tiles(
         entries.seal()
         compute = partial(_compute, statistic=statistic, area=grid.size**2)
         for bucket in range(number):
-            for tile, values in _compute_bucket(entries, bucket, compute, held):
+            for tile, values in _compute_bucket(entries, bucket, compute, in_memory):
                 yield *divmod(tile, across), values
     finally:
         entries.close()
@@ -396,23 +396,23 @@ def is_in_bounds(rows: np.ndarray, bounds: Box | None) -> np.ndarray:
 
 
 def _compute_bucket(
-    entries: Spool, bucket: int, compute: Callable[[np.ndarray], np.ndarray], held: int
+    entries: Spool, bucket: int, compute: Callable[[np.ndarray], np.ndarray], in_memory: int
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Number and values (bands, TILE, TILE) of every tile of a bucket."""
     total = sum(len(piece) for piece in entries.pieces(bucket))
-    if total <= held:
+    if total <= in_memory:
         rows = entries.read(bucket)
         rows = rows[np.argsort(rows["tile"], kind="stable")]
         tiles, first = np.unique(rows["tile"], return_index=True)
         for tile, part in zip(tiles.tolist(), np.split(rows, first)[1:], strict=True):
             yield tile, compute(part)
         return
-    # It does not fit in memory: groups of cells of a tile, each of about `held` points, one by one.
+    # It does not fit in memory: groups of cells of a tile, each of about `in_memory` points, one by one.
     for tile in np.unique(np.concatenate([np.unique(piece["tile"]) for piece in entries.pieces(bucket)])).tolist():
         count = np.zeros(TILE * TILE, np.int64)
         for piece in entries.pieces(bucket):
             count += np.bincount(piece["cell"][piece["tile"] == tile], minlength=len(count))
-        group = np.cumsum(count) // held
+        group = np.cumsum(count) // in_memory
         values = np.full((TILE, TILE), np.nan)
         for number in np.unique(group[count > 0]).tolist():
             wanted = group == number
@@ -486,12 +486,12 @@ def grid_values(
     *,
     size: float | None = None,
     bounds: Box | None = None,
-    held: int = HELD_POINTS,
+    in_memory: int = POINTS_IN_MEMORY,
 ) -> Raster:
     """The map of a column of clouds; medians of large clouds need room in TMPDIR.
 
     size: side of a cell [m], by default for about POINTS_PER_CELL points per cell. bounds: west, south, east, north
-    [m], by default all points but far outliers. held: points in memory at a time.
+    [m], by default all points but far outliers. in_memory: points at a time.
     Raises InputError if there is nothing to draw, ConfigError for wrong options, more than MOST_CELLS cells, and clouds
     that are far apart or differ in their CRS.
     """
@@ -508,7 +508,7 @@ def grid_values(
         raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
     grid = choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
     values, placed = np.full((grid.rows, grid.columns), np.nan), Placed()
-    for row, column, tile in compute_tiles(clouds, statistic, grid, total.values, placed, held=held):
+    for row, column, tile in compute_tiles(clouds, statistic, grid, total.values, placed, in_memory=in_memory):
         part = values[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
         part[:] = tile[0, : part.shape[0], : part.shape[1]]
     values = values[::-1]  # the first row is the southernmost

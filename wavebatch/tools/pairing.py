@@ -98,18 +98,18 @@ class Comparison:
 
 
 def compare_clouds(
-    a: Path, b: Path, *, tolerance_ns: float = 1.0, selection: PointFilter = EVERY, held: int = BUCKET_ROWS
+    a: Path, b: Path, *, tolerance_ns: float = 1.0, selection: PointFilter = EVERY, in_memory: int = BUCKET_ROWS
 ) -> Comparison:
     """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
 
     Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
     nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
-    without an echo are ignored. selection: only these points are compared, in both clouds. held: rows in memory at a
-    time; large clouds need room in TMPDIR.
+    without an echo are ignored. selection: only these points are compared, in both clouds. in_memory: rows at a time;
+    large clouds need room in TMPDIR.
     Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance, an unknown column, or
     coordinates without a length.
     """
-    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns, held) as task:
+    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns, in_memory) as task:
         for reader, side in ((first, 0), (second, 1)):
             reader.select(selection)
             for rows in read_echoes(reader):
@@ -130,18 +130,18 @@ PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
 
 
 def compare_truth(
-    a: Path, truth: Path, *, tolerance_ns: float = 1.5, selection: PointFilter = EVERY, held: int = BUCKET_ROWS
+    a: Path, truth: Path, *, tolerance_ns: float = 1.5, selection: PointFilter = EVERY, in_memory: int = BUCKET_ROWS
 ) -> Comparison:
     """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does.
 
-    selection: only these points of the cloud; the truth is whole, so that true echoes of other points are missed. held:
-    rows in memory at a time.
+    selection: only these points of the cloud; the truth is whole, so that true echoes of other points are missed.
+    in_memory: rows at a time.
     """
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
         cloud.select(selection)
         points = max(cloud.point_count, reference.meta.get("packets", 0))
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
-        buckets = count_buckets(points, held)
+        buckets = count_buckets(points, in_memory)
         with CloudTask(True, check_tolerance(tolerance_ns), buckets, reference.meta) as task:
             for rows in read_echoes(cloud):
                 task.add(0, rows)
@@ -170,7 +170,7 @@ LEAST_SHARED = 0.05
 """Share of the pulses that two clouds of one strip have in common at least; else echoes are matched by position."""
 
 
-def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS) -> CloudTask:
+def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, in_memory: int = BUCKET_ROWS) -> CloudTask:
     """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
     by_time = pulses_told_apart(first) and pulses_told_apart(second)
     if by_time:
@@ -188,7 +188,7 @@ def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, held
     for reader in (first, second):
         reader.measure_in_metres()
     points = max(first.point_count, second.point_count)
-    task = CloudTask(by_time, check_tolerance(tolerance_ns), count_buckets(points, held))
+    task = CloudTask(by_time, check_tolerance(tolerance_ns), count_buckets(points, in_memory))
     if not by_time and task.number > 1:
         # Borders along x, so that all buckets have about the same number of points.
         some = np.concatenate([rows["xyz"][::100, 0] for rows in first.read_pieces()])

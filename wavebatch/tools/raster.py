@@ -334,9 +334,10 @@ class GridResult(cells.Placed):
 
 
 def write_grid(
-    paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False, held: int = cells.HELD_POINTS
+    paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False,
+    in_memory: int = cells.POINTS_IN_MEMORY,
 ) -> GridResult:
-    """Write the raster; held: points in memory at a time.
+    """Write the raster; in_memory: points at a time.
 
     Raises ConfigError for wrong options, InputError for clouds that cannot be read or have no point to write.
     """
@@ -436,7 +437,7 @@ def write_grid(
     else:  # what the metrics assume
         tags |= {"LEAF_PROJECTION": f"{metrics.options.leaf_projection:g}", "VOXEL_SIZE": f"{metrics.size:g}"}
     with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
-        tiles = cells.compute_tiles(clouds, statistic, grid, points, result, options.bbox, held=held)
+        tiles = cells.compute_tiles(clouds, statistic, grid, points, result, options.bbox, in_memory=in_memory)
         for row, column, values in tiles:
             result.filled += int(np.isfinite(values).any(axis=0).sum())
             writer.write_tile(row, column, values)

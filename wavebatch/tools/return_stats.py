@@ -363,7 +363,7 @@ def count_returns(
     *,
     divisions: Sequence[Division] = (),
     selection: PointFilter = EVERY,
-    held: int = BUCKET_ROWS,
+    in_memory: int = BUCKET_ROWS,
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 
@@ -372,12 +372,12 @@ def count_returns(
     selection: count only these points. divisions: count also by areas; a pulse belongs, with all its returns, to the
     area of its first return. skip: called with the InputError of a cloud that cannot be read, which is then left out;
     without it, the error is raised.
-    held: rows in memory at a time; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
+    in_memory: rows at a time; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
     """
     each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
     for path in clouds:
         try:
-            tally = _tally_cloud(Path(path), divisions, selection, held)
+            tally = _tally_cloud(Path(path), divisions, selection, in_memory)
         except InputError as error:
             if skip is None:
                 raise
@@ -399,7 +399,7 @@ def pulses_told_apart(reader: CloudReader) -> bool:
     return rows is None or len(np.unique(rows["gps_time"])) * MOST_RETURNS >= len(rows)
 
 
-def _tally_cloud(path: Path, divisions: Sequence[Division], selection: PointFilter, held: int) -> _Tally:
+def _tally_cloud(path: Path, divisions: Sequence[Division], selection: PointFilter, in_memory: int) -> _Tally:
     with CloudReader(path, RETURN_DTYPE) as reader:
         by_time = pulses_told_apart(reader)  # by all points
         reader.select(selection)
@@ -416,10 +416,10 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], selection: PointFilt
             tally.notes.append(f"coordinates are {reader.unit}: first to last is along Z, which is no height")
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
-        number = count_buckets(reader.point_count, held)
+        number = count_buckets(reader.point_count, in_memory)
         with Spool(number, _ROW) as buckets:
             keys = _Keys(by_time)
-            for rows in reader.read_pieces(held):
+            for rows in reader.read_pieces(in_memory):
                 if tally.flags is not None:
                     tally.flags += [int(np.count_nonzero(rows["flags"] & np.uint16(flag))) for flag in EchoFlag]
                 shaped = np.zeros(len(rows), _ROW)

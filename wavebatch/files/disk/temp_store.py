@@ -148,7 +148,7 @@ class Spool(Closing):
         """The temporary file; None while all entries are in memory."""
         self.count = 0
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
-        self._held = 0
+        self._in_memory = 0
         self._segments: list[int] = []
         self._memory: tuple[np.ndarray, np.ndarray] | None = None
         self._sealed = False
@@ -163,9 +163,9 @@ class Spool(Closing):
         if not len(entries):
             return
         self._pending.append((bucket.astype(np.int64), entries.astype(self.dtype, casting="same_kind", copy=False)))
-        self._held += entries.nbytes + 8 * len(bucket)
+        self._in_memory += entries.nbytes + 8 * len(bucket)
         self.count += len(entries)
-        if self._held >= self._most:
+        if self._in_memory >= self._most:
             self._write(*self._take_pending())
 
     def seal(self) -> Spool:
@@ -227,7 +227,7 @@ class Spool(Closing):
 
     def _take_pending(self) -> tuple[np.ndarray, list[np.ndarray]]:
         """Start of every bucket, i8 (buckets + 1,), and the entries sorted by bucket, in parts."""
-        pending, self._pending, self._held = self._pending, [], 0
+        pending, self._pending, self._in_memory = self._pending, [], 0
         parts = [part for _, part in pending]
         if not pending:
             return np.zeros(self.buckets + 1, np.int64), parts
@@ -349,7 +349,7 @@ class RowStore:
         self._draft.discard()
 
 
-HELD_ROWS = 1 << 18
+ROWS_IN_MEMORY = 1 << 18
 """Rows in memory before they are sorted and written to disk."""
 
 STRIDE = 256
@@ -359,12 +359,12 @@ STRIDE = 256
 class KeyedSums(Closing):
     """Sums of `columns` integers per key: `add` any number of times, then `pieces`, then `close`.
 
-    held: rows in memory; more rows go to a temporary file. stride: rows between two keys that mark places in it.
+    in_memory: most rows there; more rows go to a temporary file. stride: rows between two keys that mark places in it.
     A context manager.
     """
 
-    def __init__(self, columns: int, *, held: int = HELD_ROWS, stride: int = STRIDE) -> None:
-        self._held, self._stride = held, stride
+    def __init__(self, columns: int, *, in_memory: int = ROWS_IN_MEMORY, stride: int = STRIDE) -> None:
+        self._in_memory, self._stride = in_memory, stride
         self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
         self._number = 0
@@ -383,9 +383,9 @@ class KeyedSums(Closing):
             return
         self._parts.append(_sum([(key, value)]))
         self._number += len(self._parts[-1][0])
-        if self._number > self._held:
+        if self._number > self._in_memory:
             self._shrink()
-            if self._number > self._held // 2:
+            if self._number > self._in_memory // 2:
                 self._spill()
 
     def pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -395,9 +395,9 @@ class KeyedSums(Closing):
             yield from self._parts
             return
         self._spill()
-        # Ascending ranges of keys with about `held` rows each; none is empty.
+        # Ascending ranges of keys with about `in_memory` rows each; none is empty.
         marks = np.sort(np.concatenate([run.marks for run in self._runs]))
-        borders = np.unique(marks[:: max(self._held // self._stride, 1)]).tolist()
+        borders = np.unique(marks[:: max(self._in_memory // self._stride, 1)]).tolist()
         for low, high in zip(borders, [*borders[1:], 1 << 64], strict=True):
             touched = [run for run in self._runs if int(run.marks[0]) < high and run.last >= low]
             parts = []
@@ -470,9 +470,9 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 divided by the golden ratio: multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
 
 
-def count_buckets(rows: int, held: int = BUCKET_ROWS) -> int:
-    """Return how many buckets of at most `held` rows are needed, at most MOST_BUCKETS."""
-    return min(-(-max(rows, 1) // held), MOST_BUCKETS)
+def count_buckets(rows: int, in_memory: int = BUCKET_ROWS) -> int:
+    """Return how many buckets of at most `in_memory` rows are needed, at most MOST_BUCKETS."""
+    return min(-(-max(rows, 1) // in_memory), MOST_BUCKETS)
 
 
 def time_keys(gps_time: np.ndarray) -> np.ndarray:

@@ -101,19 +101,19 @@ class _LazEncoder(PointEncoder):
         file.write(bytes(8))
         self._chunks: list[tuple[int, int]] = []
         """Points and bytes of each."""
-        self._held: list[np.ndarray] = []
+        self._waiting: list[np.ndarray] = []
         self._count = 0
         """Of the points held."""
 
     def write(self, rows: np.ndarray) -> None:
-        self._held.append(rows.copy())
+        self._waiting.append(rows.copy())
         self._count += len(rows)
         if self._count >= CHUNK_POINTS:
-            held = np.concatenate(self._held)
+            waiting = np.concatenate(self._waiting)
             whole = self._count // CHUNK_POINTS * CHUNK_POINTS
             for first in range(0, whole, CHUNK_POINTS):
-                self.append(compress_rows(held[first : first + CHUNK_POINTS], self._format))
-            self._held, self._count = [held[whole:].copy()], self._count - whole
+                self.append(compress_rows(waiting[first : first + CHUNK_POINTS], self._format))
+            self._waiting, self._count = [waiting[whole:].copy()], self._count - whole
 
     def append(self, chunk: Chunk) -> None:
         if self._chunks and self._chunks[-1][0] != CHUNK_POINTS or chunk.points > CHUNK_POINTS:
@@ -123,7 +123,7 @@ class _LazEncoder(PointEncoder):
 
     def finish(self) -> None:
         if self._count:
-            self.append(compress_rows(np.concatenate(self._held), self._format))
+            self.append(compress_rows(np.concatenate(self._waiting), self._format))
         table = BytesIO()
         lazrs.write_chunk_table(table, self._chunks, lazrs.LazVlr(self._coding))
         at = self._file.tell()

@@ -176,7 +176,7 @@ LEAST_NEGATIVE, MOST_REFLECTANCE, BRIGHT = 0.01, 1.5, 0.1
 white ones half more than a matt one; and share of values above that from which it is no reflectance. Backscatter
 coefficients are four times as large."""
 
-MOST_HELD_ERROR = 0.3
+MOST_AIR_ERROR = 0.3
 """Error of the share of the air that a column holds from which the share is not known: it is 0 or 1. Beyond -0.5 and
 1.5 something else changes with the range."""
 
@@ -313,8 +313,8 @@ def measure_column(
             reason = f"its median is {blank.reflectance:.3g}, {bright:.0%} exceed {MOST_REFLECTANCE:g}, as no surface "
             reason += "does: no reflectance in dB (below 0), nor as a share of 1"
         return replace(blank, refused=reason), rows[:0], np.empty(0)
-    constant, held, air_err = _take_off_air(4.0 * facing / rows["light"], rows["distance"], attenuation)
-    result = replace(summarise(blank, constant), air=held)
+    constant, left, air_err = _take_off_air(4.0 * facing / rows["light"], rows["distance"], attenuation)
+    result = replace(summarise(blank, constant), air=left)
     # By both: classes of one alone differ where that one is noisy.
     order = np.argsort(facing * rows["light"], kind="stable")
     classes = np.array_split(constant[order], min(CLASSES, len(rows) // LEAST_ECHOES))
@@ -341,11 +341,11 @@ def _take_off_air(
     whole = float(np.median(loss))
     if not squares > 0.0:
         return constant, None, whole
-    held = -float(apart @ value[kept]) / squares
-    error = float(np.std(value[kept] - value[kept].mean() + held * apart)) / np.sqrt(squares)
-    if error > MOST_HELD_ERROR or abs(held - 0.5) > 1.0:
+    left = -float(apart @ value[kept]) / squares
+    error = float(np.std(value[kept] - value[kept].mean() + left * apart)) / np.sqrt(squares)
+    if error > MOST_AIR_ERROR or abs(left - 0.5) > 1.0:
         return constant, None, whole
-    return constant * np.exp(held * loss), held, error * whole
+    return constant * np.exp(left * loss), left, error * whole
 
 
 def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:

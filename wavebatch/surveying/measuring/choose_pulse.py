@@ -228,8 +228,8 @@ def choose_pulse(
     rows = spread_rows(len(block), 2 * number)
     small = len(rows) < HALVED
     part = block.rows(rows)
-    taught, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
-    few = thin_block(held, FEWEST)
+    taught, judged = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
+    few = thin_block(judged, FEWEST)
     if plain:
         own = _find_gaussian(taught, starts["gaussian"], CHANGES[1])
         plain = abs(own.sigma_ref / starts["gaussian"].sigma_ref - 1) < MOST_SPREAD
@@ -244,17 +244,17 @@ def choose_pulse(
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    learned = [] if plain else _learn(taught, held, begin)
+    learned = [] if plain else _learn(taught, judged, begin)
     # Where too few echoes teach further, what lone echoes teach jointly stands for itself.
     tried = {one.name: one.system for one in hopeful if one.name != JOINTLY or not learned}
     tried |= {OF_ALL: own} if plain else {}
-    found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    found = _try_changes(held, found + learned)
+    found = [_judge(judged, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
+    found = _try_changes(judged, found + learned)
     choice = _decide(found, small=small)
     if choice.best.name in starts and not _is_as_wide(choice.best, begin):
         # Few waveforms showed another start: what was learned from it may be of another pulse.
-        again = [replace(one, name=one.name + AGAIN) for one in _learn(taught, held, choice.best)]
-        found += _try_changes(held, again)
+        again = [replace(one, name=one.name + AGAIN) for one in _learn(taught, judged, choice.best)]
+        found += _try_changes(judged, again)
         choice = _decide(found, small=small)
     if choice.tied and len(rows) < len(block):
         others = np.delete(np.arange(len(block)), rows[::2])
@@ -303,12 +303,12 @@ def _find_gaussian(block: WaveformBlock, system: SystemPulse, change: float) -> 
     return replace(system, sigma_ref=system.sigma_ref * own)
 
 
-def _learn(taught: WaveformBlock, held: WaveformBlock, begin: Candidate) -> list[Candidate]:
+def _learn(taught: WaveformBlock, judged: WaveformBlock, begin: Candidate) -> list[Candidate]:
     """Pulses learned from some waveforms and judged on others; of all echoes the round that is described shortest.
 
     Where echoes are close, the first rounds end far from the pulse.
     """
-    found = [_judge(held, name, system, CHANGES[1], known=False) for name, system in _list_rounds(taught, begin)]
+    found = [_judge(judged, name, system, CHANGES[1], known=False) for name, system in _list_rounds(taught, begin)]
     if not found or found[-1].name != OF_ANY:
         return found
     rounds = found[-2:]
@@ -318,7 +318,7 @@ def _learn(taught: WaveformBlock, held: WaveformBlock, begin: Candidate) -> list
             break
         explained = explain(taught, bear(last.system, begin.change))
         system = learn_jointly(taught, last.system, explained, begin.change, last=True)
-        rounds.append(_judge(held, OF_ANY, system, CHANGES[1], known=False))
+        rounds.append(_judge(judged, OF_ANY, system, CHANGES[1], known=False))
     return [*found[:-1], min(rounds[1:], key=lambda one: one.typical)]
 
 

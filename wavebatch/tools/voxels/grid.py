@@ -28,7 +28,7 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.npz import NpzWriter, read_npz, reading_npz
 from wavebatch.files.disk.publish import Draft, protecting, publish_together
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.disk.temp_store import HELD_ROWS, KeyedSums
+from wavebatch.files.disk.temp_store import ROWS_IN_MEMORY, KeyedSums
 from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import name_crs, repair_records, repair_wkt
 from wavebatch.files.las.write_points import PointFile
@@ -93,7 +93,7 @@ class VoxelGrid(Closing):
     size: of the voxels [m]; faces lie at multiples of it. anchor: index of a voxel in the middle of the strip, counted
     from the origin of the coordinates, i8 (3,). unit: of energies [DN ns]. sections: whether rays have cross sections.
     everything: also keeps voxels that rays crossed without any signal. floor: the ground, for FOREST_COLUMNS; None:
-    without them. held: see KeyedSums.
+    without them. in_memory: see KeyedSums.
     """
 
     def __init__(
@@ -105,14 +105,14 @@ class VoxelGrid(Closing):
         sections: bool,
         everything: bool,
         floor: Floor | None = None,
-        held: int = HELD_ROWS,
+        in_memory: int = ROWS_IN_MEMORY,
     ) -> None:
         self.size, self.anchor = size, anchor
         self.columns = tuple(column for column in COLUMNS if sections or column.name != "cross_section")
         self.columns += () if floor is None else FOREST_COLUMNS
         self._unit, self._sections, self._everything, self._floor = unit, sections, everything, floor
         self._width = 8 if floor is None and not sections else 10 if floor is None else 12
-        self._sums = KeyedSums(self._width, held=held)
+        self._sums = KeyedSums(self._width, in_memory=in_memory)
         self._low = np.full(3, np.iinfo(np.int64).max)
         self._high = np.full(3, np.iinfo(np.int64).min)
         self._energy = 0

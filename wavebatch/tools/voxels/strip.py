@@ -26,7 +26,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
-from wavebatch.files.disk.temp_store import HELD_ROWS
+from wavebatch.files.disk.temp_store import ROWS_IN_MEMORY
 from wavebatch.files.las.header import locate, split_numbers
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -182,15 +182,15 @@ def voxelize_strip(
     profiles: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
     block_size: int | None = None,
-    held: int = HELD_ROWS,
+    in_memory: int = ROWS_IN_MEMORY,
     unit_points: int | None = None,
 ) -> VoxelSummary:
     """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
 
     system: a saved survey, instead of a survey of this strip. force: also where the strip contradicts it. calibration:
     for cross sections; it or the survey must have the divergence of the beam. profiles: an .npz for those of single
-    pulses. progress: called with the number of waveforms done since the last call, and the total. block_size, held,
-    unit_points: packets at a time, sums in memory and points of a unit; the output does not depend on them.
+    pulses. progress: called with the number of waveforms done since the last call, and the total. block_size,
+    in_memory, unit_points: packets at a time, sums in memory and points of a unit; the output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
@@ -275,7 +275,7 @@ def voxelize_strip(
             voxel_grid.VoxelGrid(
                 options.size, np.floor(middle / options.size).astype(np.int64), voxel_grid.energy_unit(most_bits),
                 sections=calibration is not None, everything=options.all_crossed or options.forest,
-                floor=tracer.floor if options.forest else None, held=held,
+                floor=tracer.floor if options.forest else None, in_memory=in_memory,
             ) as grid,
             (
                 voxel_grid.ProfileWriter(Path(profiles), strip, sections=calibration is not None, overwrite=overwrite)
