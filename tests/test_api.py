@@ -395,6 +395,22 @@ def test_read_cloud_reads_only_what_is_asked_for(clouds):
     assert wb.read_cloud(clouds[0] / "urban.laz", given).dtype.names == ("z", "echo_width")
 
 
+@pytest.mark.parametrize(("names", "provenance"), [("wavebatch", True), ("wavebatch", False), ("asprs", True)])
+def test_what_laspy_writes_again_has_no_numbers_for_no_data(strips, tmp_path, names, provenance):
+    """laspy drops the declarations where it adds a dimension: amplitudes of -9999 were in means and histograms."""
+    wb.run(strips[0], tmp_path, chain="fast", names=names)
+    cloud = laspy.read(tmp_path / "urban.laz")
+    cloud.add_extra_dim(laspy.ExtraBytesParams("above_ground", np.float32))
+    if not provenance:
+        cloud.header.vlrs = [vlr for vlr in cloud.header.vlrs if vlr.user_id != "wavebatch"]
+    cloud.write(tmp_path / "more.laz")
+    assert all(one.no_data is None for one in cloud.point_format.extra_dimensions)
+    wanted, found = (wb.read_cloud(tmp_path / name) for name in ("urban.laz", "more.laz"))
+    assert np.isnan(found["amplitude"]).any()
+    for column in wanted.dtype.names:
+        np.testing.assert_array_equal(found[column], wanted[column])
+
+
 # Real data
 
 

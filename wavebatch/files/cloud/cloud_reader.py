@@ -135,6 +135,14 @@ class CloudReader(Closing):
                         and (column != "echo_flags" or self.extra[name].dtype.kind == "u")}  # fmt: skip
         """The file's name of each wavebatch column, by the provenance of the latest run; empty without one. Columns
         that another program has renamed, left out or stored as several numbers, or flags as signed ones, are none."""
+        # Other programs drop the declaration of no-data, laspy where it adds a dimension: -9999 would be an amplitude.
+        for column, field in self._find_ours(COLUMNS, decibel=True).items():
+            record, stored = self.extra[field], [style[column] for style in STYLES.values() if column in style]
+            empty = COLUMNS[column].no_data
+            if record.dtype.kind != "f":
+                empty = next((one.no_data for one in stored if one.scale), None)
+            if record.no_data is None and empty is not None:
+                self.extra[field] = record.with_no_data([empty])
         self._sources = self._find_ours((*las.field_names(dtype), "echo_flags"))
         self.columns = tuple(name for name in las.field_names(dtype) if name in self._sources)
         """The wavebatch columns among the fields that the cloud has."""
