@@ -257,3 +257,27 @@ def test_returns_off_their_ray_are_in_the_error_and_in_a_line(tmp_path, edit_poi
     number, before, after = clouds[0].return_number, *(cloud["range_err"] for cloud in clouds)
     assert (before[number == 1] == after[number == 1]).all()
     assert np.median(after[number == 2]) > 10.0 * np.median(before[number == 2])
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("return_point_wave_location", lambda part: part["return_point_wave_location"] + 5000.0, "where their packets"),
+        ("return_point_wave_location", lambda part: part["return_point_wave_location"] - 3000.0, "where their packets"),
+        ("y_t", lambda part: -part["y_t"], "the second lies off its ray"),
+        ("x_t", lambda part: part["x_t"], ""),
+    ],
+    ids=["later", "earlier", "mirrored", "sound"],
+)
+def test_a_stretch_of_wrong_locations_or_vectors_is_named(tmp_path, edit_points, name, change, said):
+    """A fifth of the strip had echoes .4 to .8 m off, in silence."""
+
+    def spoil(points):
+        part = slice(int(0.4 * len(points)), int(0.6 * len(points)))
+        points[name][part] = change(points[part])
+
+    simulate_strip("forest", tmp_path / "a.las", pulses=6000, seed=4)
+    edit_points(tmp_path / "a.las", tmp_path / "b.las", spoil)
+    done = succeed("run", tmp_path / "b.las", "-o", tmp_path, "--profile", "fast")
+    texts = ("where their packets", "the second lies off its ray")
+    assert [text for text in texts if text in done.stderr] == [said] * bool(said)

@@ -99,6 +99,8 @@ class RunReport:
     """Echoes that reflect more than a white matt surface, level or facing the sensor."""
     last_left_out: int = 0
     """Points of left_out["where"] that are the last echo of their pulse."""
+    strayed_returns: int = 0
+    """Returns in stretches where too few match an echo of their packet."""
     copied_echoes: int = 0
     """Echoes that do not count, because another packet of their pulse has them too."""
     remarks: tuple[str, ...] = ()
@@ -201,6 +203,7 @@ class RunReport:
                 "reflectance_above_one": self.above_one,
                 "last_echoes_left_out": self.last_left_out,
                 "copied_echoes": self.copied_echoes,
+                "strayed_returns": self.strayed_returns,
                 **histograms,
             },
         }
@@ -228,6 +231,7 @@ class RunReport:
             above_one=int(quality.get("reflectance_above_one", 0)),
             last_left_out=int(quality.get("last_echoes_left_out", 0)),
             copied_echoes=int(quality.get("copied_echoes", 0)),
+            strayed_returns=int(quality.get("strayed_returns", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=histograms["amplitude_dn"],
             echo_width=histograms["echo_width_ns"],

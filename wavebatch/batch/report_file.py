@@ -499,7 +499,13 @@ def find_warnings(
         found += warn("foreign-packets", [f"--force: {prepared.scan.stranger}"])
     else:
         matched = report.count("matched_returns")
-        lines = doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
+        lines = [*doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))]
+        if not lines and report.strayed_returns and "foreign-packets" not in prepared.scan.doubts.values():
+            lines = [
+                f"about {report.strayed_returns} returns, in stretches of the strip, lie where their packets have no "
+                "echo, the others do: their return locations or packets are wrong, new echoes there may be off by more "
+                "than range_err, and returns have none; get the file again"
+            ]
         found += warn("foreign-packets", lines)
     found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()
     # Flags of failed fits that far more echoes have than usual.

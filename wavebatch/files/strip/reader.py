@@ -556,7 +556,10 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
     """Compare returns of one pulse at up to SCALE_PLACES places of the strip; nothing with fewer than LEAST_PAIRS."""
     ratios, bends = [np.empty(0)], [np.empty(0)]
     units = _choose_units(scan)
-    for start, stop in units[:: max(1, -(-len(units) // SCALE_PLACES))]:
+    units, each = units[:: max(1, -(-len(units) // SCALE_PLACES))], max(SCALE_PLACES // max(len(units), 1), 1)
+    places = [(first, stop) for begin, stop in units
+              for first in range(begin, stop, max((stop - begin) // each, SLICE_POINTS))]  # fmt: skip
+    for start, stop in places:
         points = reader.read_points(start, min(start + SLICE_POINTS, stop), scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
