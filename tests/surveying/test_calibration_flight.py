@@ -172,6 +172,8 @@ def test_channels_without_any_tie_have_the_constants_of_their_targets():
     found = adjust_constants(nothing, Anchors(np.array([0.1, np.nan, 0.4]), np.array([0.01, np.nan, 0.02])))
     assert found.value[[0, 2]].tolist() == pytest.approx([0.1, 0.4], rel=1e-9) and np.isnan(found.value[1])
     assert found.error[[0, 2]] == pytest.approx([0.01, 0.02], rel=0.35)
+    anchors, seen = Anchors(np.zeros(2), np.full(2, 0.01)), np.zeros(2, VIEW)
+    assert fit_swath(nothing, anchors, seen, np.array([4, 8]), asked=False)[1:] == ((), 0.0, None)
 
 
 def test_cells_that_are_rough_or_seen_in_one_line_tie_nothing(rng):

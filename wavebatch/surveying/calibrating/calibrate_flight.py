@@ -246,7 +246,7 @@ def fit_swath(
         If the overlaps do not determine the term.
     """
     most = float(np.abs(ties.view["angle"]).max(initial=0.0))
-    columns, edge = swath_columns(ties.view["angle"], most or 1.0), np.inf
+    columns, edge = swath_columns(ties.view["angle"], most or 1.0), np.inf if asked else 0.0
     at_targets = np.nan_to_num(swath_columns(seen["angle"], most or 1.0))
     # Do constants and a term that is alike on both sides stand for one that falls from side to side?
     # They do where headings are alike, and where two strips of opposite headings overlap.
@@ -256,7 +256,7 @@ def fit_swath(
     odd = bool(len(rest) and np.nanstd(rest) > LEAST_LEFT)
     used = (3 if odd else 2) * asked
     adjusted = adjust.adjust_constants(ties, replace(anchors, columns=at_targets[:, :used]), columns[:, :used])
-    if len(ties.cell):
+    if asked and len(ties.cell):
         edge = max(float(np.std(adjusted.term_trials @ side[:used], ddof=1)) for side in _EDGES)
     if asked and not 0 < edge <= MOST_EDGE_ERROR:
         raise InputError(
@@ -265,7 +265,7 @@ def fit_swath(
         )
     swath = (most, *map(float, adjusted.terms), *(0.0,) * (3 - used)) if asked else ()
     if odd or not len(ties.cell):
-        return adjusted, swath, edge * asked, None
+        return adjusted, swath, edge, None
     # The error of the constants if they differ because each strip was seen from another side, or if the light falls
     # from side to side and not to both edges, where that explains the overlaps nearly as well.
     side, n, grid = columns[:, 2], len(adjusted.value), np.linspace(-1.0, 1.0, 21)
@@ -279,7 +279,7 @@ def fit_swath(
         apart = float(np.mean(adjusted.value[known] - other.value[known]))
         apart = apart + swath_columns(grid, 1.0) @ [*adjusted.terms, -other.terms[0]]
         error = max(error, float(np.sqrt(np.mean(apart**2))))
-    return adjusted, swath, edge * asked, error
+    return adjusted, swath, edge, error
 
 
 def find_trend(
