@@ -1,21 +1,17 @@
 """Strips of at most 1 MB that ask for much work, and commands run on them under limits of memory and processor time.
 
 `draw_plan` is the only source of chance and takes plain numbers from a `random.Random` (hypothesis has one:
-`st.randoms`). `.venv/bin/python tests/heavy_strips.py --strips 200 --seed 1` runs all commands on random strips and
-prints what broke a promise and the dearest runs, also after Ctrl-C.
+`st.randoms`). More seeds of `tests/test_heavy_strips.py` are more strips.
 """
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import os
 import random
 import re
 import resource
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -183,33 +179,3 @@ def attack(folder: Path, plan: Plan, commands: list[str]) -> list[Done]:
     """Build the strip of a plan and run commands on it."""
     strip = build_strip(plan, folder / ("a.laz" if plan.seed % 4 == 0 else "a.las"))
     return [run_limited(command, strip, folder / str(number)) for number, command in enumerate(commands)]
-
-
-def _start() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--strips", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--tools", action="store_true", help="also a random one of the other commands")
-    options = parser.parse_args()
-    dearest, largest, failures, strips = (0.0, None), (0, None), 0, 0
-    with contextlib.suppress(KeyboardInterrupt):
-        for number in range(options.strips):
-            rng = random.Random(f"{options.seed} {number}")
-            plan = draw_plan(rng)
-            commands = [*COMMANDS, *([rng.choice(TOOLS)] if options.tools else [])]
-            with tempfile.TemporaryDirectory() as folder:
-                for done in attack(Path(folder), plan, commands):
-                    if done.wrong:
-                        failures += 1
-                        print(f"{plan}\n    {done.command}: {done.wrong}", flush=True)
-                    dearest = max(dearest, (done.seconds, (done.command, plan)), key=lambda kept: kept[0])
-                    largest = max(largest, (done.memory, (done.command, plan)), key=lambda kept: kept[0])
-            strips += 1
-    print(f"{strips} strips, {failures} failures")
-    print(f"dearest: {dearest[0]:.1f} s of a processor: {dearest[1]}")
-    print(f"largest: {largest[0] >> 20} MB: {largest[1]}")
-    return failures > 0
-
-
-if __name__ == "__main__":
-    sys.exit(_start())
