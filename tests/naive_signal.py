@@ -7,8 +7,6 @@ from scipy.linalg import toeplitz
 
 from wavebatch.kernels.signal import noise
 
-QUANTISATION_STD = 1 / np.sqrt(12)
-
 
 def widen_after(mask, reach):
     """Boolean (s, n) with `reach` samples marked after every true one."""

@@ -250,7 +250,7 @@ def test_clouds_are_read_in_pieces_and_twice(tmp_path):
 
 
 @pytest.mark.parametrize("by", ["time", "place"])
-def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatch, by):
+def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, by):
     pulse, times, xyz, ray = make_pulses(2000, seed=6)
     rng = np.random.default_rng(7)
     _, number, total = number_returns(np.bincount(pulse))
@@ -529,7 +529,6 @@ def test_what_the_readme_says_of_the_real_strip(riegl):
 
 
 FINE = 100.0
-LEARNED = ((1.0, 0.0, 2.0), (0.12, 7.0, 2.0))
 
 
 def record(y, std):
@@ -547,15 +546,6 @@ def test_every_decomposer_says_what_it_fits():
     steps = [Step(stage) for stage in STAGES.values() if stage.kind == "decompose"]
     unfitted = {step.stage.name for step in steps if fitted_pulse(step, SystemPulse(2.0), 1.0) is None}
     assert unfitted == {"decompose.none"}
-
-
-CASES = [(name, {}, {}) for name in ("closed_form", "gaussian", "residual_loop", "asdf_only")]
-CASES += [("adaptive", {}, {}), ("adaptive", {}, {"components": LEARNED}), ("reference", {}, {"components": LEARNED})]
-CASES += [("reference", {"model": "stretched"}, {"components": LEARNED})]
-CASES += [("generalized_gaussian", {}, {}), ("residual_loop", {"model": "generalized"}, {})]
-CASES += [("residual_loop", {"model": "learned"}, {"components": LEARNED})]
-CASES += [("residual_loop", {"model": "skewed"}, {"kappa": 0.12}), ("skewed", {"kappa": "free"}, {"kappa": 0.12})]
-CASES += [("skewed", {}, {"kappa": 0.12}), ("skewed", {"kappa": 0.12}, {}), ("adaptive", {}, {"kappa": 0.12})]
 
 
 def test_what_was_not_fitted_is_no_data():
@@ -608,10 +598,6 @@ def test_as_a_loop_does_it(rng):
         assert found[name].median == pytest.approx(np.median(naive_e[rows]), rel=1e-4)
         assert found[name].floor_mean == pytest.approx(naive_floor[rows].mean(), rel=1e-4)
         assert found[name].floor_median == pytest.approx(np.median(naive_floor[rows]), rel=1e-4)
-
-
-WANG = [(0.104, 0.0214, 0.0089, 0.0069), (0.184, 0.0158, 0.0100, 0.0037), (0, 0.0097, 0.0014, 0.0014)]
-WANG += [(0.05, 0.0186, 0.0058, 0.0052)]
 
 
 def test_the_floor_is_that_of_single_samples_where_noise_is_coloured():
