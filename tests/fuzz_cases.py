@@ -152,11 +152,12 @@ def test_a_failing_case_is_made_small(fuzzer):
     planted.close()
 
 
-@pytest.mark.slow
-def test_hundreds_of_damaged_inputs_break_no_promise(fuzzer):
+@pytest.mark.quick_cases("80")
+@pytest.mark.parametrize("number", [80, 600])
+def test_damaged_inputs_break_no_promise(fuzzer, number):
     fresh = Fuzzer(fuzzer.base.parent)
-    assert fuzz(fresh, 600, int(os.environ.get("FUZZ_SEED", "1")), set(), float("inf")) is None
-    assert sum(sum(codes.values()) for name, codes in fresh.codes.items() if name.startswith("[")) >= 600
+    assert fuzz(fresh, number, int(os.environ.get("FUZZ_SEED", "1")), set(), float("inf")) is None
+    assert sum(sum(codes.values()) for name, codes in fresh.codes.items() if name.startswith("[")) >= number
     inside = [codes[0] > 0 for codes in fresh.codes.values()]
-    assert sum(inside) > 0.6 * len(inside)  # commands and kinds of which some end well
+    assert number < 600 or sum(inside) > 0.6 * len(inside)  # commands and kinds of which some end well
     fresh.close()

@@ -175,6 +175,15 @@ def add_record(path: Path, record: Vlr) -> None:
     path.write_bytes(content[:size] + new + content[size:])
 
 
+def place_header(path: Path, change: Callable[[np.ndarray], object], target: Path | None = None) -> Path:
+    """The file, or a copy, with other scales, offsets (x, y, z) and bounds (most and least of x, y, z), f8 (12,)."""
+    content = bytearray(path.read_bytes())
+    content[131:227] = np.array(change(np.frombuffer(bytes(content[131:227]), "<f8")), "<f8").tobytes()
+    target = target or path
+    target.write_bytes(content)
+    return target
+
+
 def take_turns(path: Path, edit_points: Callable) -> Path:
     """Gives the pulses one of two equal digitizers in turn: blocks have them in another order than the file."""
 

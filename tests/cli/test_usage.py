@@ -5,13 +5,13 @@ Plausible mistakes of a first hour: the line says what to do next, not only what
 
 import os
 import shutil
-import struct
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from commands import run_command, succeed
-from strips import cut_strip
+from strips import cut_strip, place_header
 
 from wavebatch.cli import COMMANDS, main
 from wavebatch.files.text_file import find_files
@@ -67,9 +67,7 @@ def test_stages_lists_those_of_a_kind():
 
 
 def test_clouds_without_an_echo_in_common_are_doubted(place):
-    content = bytearray((place / "strip.las").read_bytes())
-    struct.pack_into("<d", content, 155, struct.unpack_from("<d", content, 155)[0] + 1e5)  # x of all points
-    (place / "moved.las").write_bytes(content)
+    place_header(place / "strip.las", lambda old: old + 1e5 * (np.arange(12) == 3), place / "moved.las")
     result = run_command("compare", "strip.las", "moved.las")
     assert result.exit_code == 0 and "warning: A and B have no echo in common" in result.stderr
     assert "identical         0\n" in result.stdout and "100.00%" not in result.stdout  # not a line for each class
@@ -89,7 +87,7 @@ def test_strips_that_share_their_times_only_are_doubted(place):
 
 def test_points_are_shown_where_the_packets_are_missing(place):
     content = bytearray((place / "strip.las").read_bytes())
-    content[6:8] = struct.pack("<H", 0b101)  # global encoding: packets in a .wdp
+    content[6:8] = bytes((0b101, 0))  # global encoding: packets in a .wdp
     (place / "lost.las").write_bytes(content)
     shown = run_command("info", "lost.las")
     assert shown.exit_code == 1 and "points         " in shown.stdout and "classes " in shown.stdout

@@ -14,7 +14,7 @@ from batch_tools import run_one
 from commands import fail, refuses, run_command, succeed
 from hypothesis import given
 from hypothesis import strategies as st
-from strips import add_record, descriptor, make_raw, vlr
+from strips import add_record, descriptor, make_raw, place_header, vlr
 from writer_tools import data_file, plan_output, write_source
 
 from wavebatch.core.echoes import EchoTable
@@ -224,22 +224,12 @@ def test_strips_that_are_not_in_metres_get_no_physics(tmp_path, records, message
     assert run_command(*arguments).exit_code == 0
 
 
-def in_feet(source, target):
-    """A strip without CRS whose coordinates are feet, but whose packet vectors are metres."""
-    content = bytearray(source.read_bytes())
-    for place in (131, 155, 179):
-        values = struct.unpack_from("<6d" if place > 155 else "<3d", content, place)
-        struct.pack_into(f"<{len(values)}d", content, place, *(value / 0.3048 for value in values))
-    target.write_bytes(content)
-    return target
-
-
 @pytest.mark.quick_cases("flat")
 @pytest.mark.parametrize("scene", ["urban", "flat"])
 def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
     slow = replace(find_scene(scene), flight=FlightLine(pulse_rate=50_000))
     simulate_strip(slow, tmp_path / "m.las", pulses=30_000, seed=3)
-    feet = in_feet(tmp_path / "m.las", tmp_path / "feet.las")
+    feet = place_header(tmp_path / "m.las", lambda metres: metres / 0.3048, tmp_path / "feet.las")
     chain = tmp_path / "chain.toml"
     stages = ("noise.pooled", "detect.maximum", "decompose.closed_form", "attribute.position", "attribute.range")
     chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
@@ -286,24 +276,17 @@ def test_geocentric_coordinates_are_told_by_their_size(middle, geocentric):
 def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
     raw = make_raw(60)
     raw.vlrs = [descriptor(1), *records]
-    bounds = 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3
-    arguments = _move(raw, tmp_path, 155, (4_194e3, 1_162e3, 4_647e3), bounds)
+    strip = place_header(raw.write(tmp_path / "s.las"), lambda old: (
+        *old[:3], 4_194e3, 1_162e3, 4_647e3, 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3))  # fmt: skip
+    arguments = "run", strip, "-o", tmp_path / "out", "--profile", "fast"
     fail(4, "coordinates are geocentric", *arguments, "--flight-height", "500")
     assert run_command(*arguments).exit_code == 0
 
 
-def _move(raw, folder, at, numbers, bounds):
-    """The arguments of a run of a strip whose header has other offsets (at 155), or scales (131), and other bounds."""
-    strip = raw.write(folder / "s.las")
-    content = bytearray(strip.read_bytes())
-    struct.pack_into("<3d", content, at, *numbers)
-    struct.pack_into("<6d", content, 179, *bounds)
-    strip.write_bytes(content)
-    return "run", strip, "-o", folder / "out", "--profile", "fast"
-
-
 def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
-    arguments = _move(make_raw(200), tmp_path, 131, (1e-7, 1e-7, 0.001), (15.7, 15.6, 48.7, 48.6, 400.0, 300.0))
+    strip = place_header(make_raw(200).write(tmp_path / "s.las"), lambda old: (
+        1e-7, 1e-7, 0.001, *old[3:6], 15.7, 15.6, 48.7, 48.6, 400.0, 300.0))  # fmt: skip
+    arguments = "run", strip, "-o", tmp_path / "out", "--profile", "fast"
     fail(4, "coordinates are degrees, packet vectors metres", *arguments)
     assert run_command(*arguments, "--points", "returns").exit_code == 0
 

@@ -251,27 +251,6 @@ def test_evlrs_end_where_the_file_does(tmp_path):
     assert las.find_evlrs(path, dataclasses.replace(header, version=(1, 3), evlr_count=0)) == ([], 0)
 
 
-@pytest.fixture(scope="module")
-def strip(tmp_path_factory):
-    path = tmp_path_factory.mktemp("strip") / "a.las"
-    write_strip(path, wkt="PROJCRS[...]")
-    return path
-
-
-@given(changes=st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), min_size=1, max_size=6))
-def test_any_damage_of_the_header_is_one_line_or_a_plan(strip, tmp_path, changes):
-    data = bytearray(strip.read_bytes())
-    for at, value in changes:
-        data[at] = value
-    path = tmp_path / "damaged.las"
-    path.write_bytes(data)
-    for keep in (False, True):
-        try:
-            plan_output(path, ["amplitude"], packets=facts_of(path) if keep else None)
-        except (InputError, ConfigError) as error:
-            assert "\n" not in str(error)
-
-
 @pytest.mark.parametrize("number", range(11))
 def test_fields_and_dimensions_are_those_of_laspy(number):
     known = laspy.PointFormat(number)

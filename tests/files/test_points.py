@@ -4,7 +4,6 @@ import io
 import json
 import os
 import pickle
-import random
 import struct
 from concurrent.futures import ThreadPoolExecutor
 
@@ -419,19 +418,6 @@ def write_cloud(path, point_format, n=300, extra=()):
                         intensity=rng.integers(0, 65535, n), **{name: rng.random(n) for name in extra})  # fmt: skip
 
 
-def read_all(path):
-    """Everything that the commands read of a cloud, or None where it is refused with one line."""
-    try:
-        rows = []
-        for dtype in (CLOUD_DTYPE, RETURN_DTYPE):
-            with CloudReader(path, dtype) as cloud:
-                rows.append([row for piece in cloud.read_pieces(100) for row in piece])
-    except InputError as error:
-        assert str(error).startswith(str(path)) and "\n" not in str(error)
-        return None
-    return rows
-
-
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("point_format", [0, 1, 2, 3, 6, 7, 8])
 def test_clouds_of_every_format_without_waveforms_are_read(tmp_path, point_format, suffix):
@@ -495,31 +481,6 @@ def test_no_reader_takes_several_numbers_for_a_column_that_the_account_names(tmp
         assert (rows["values"] == 2).all()
     for name in ("amplitude", "echo_flags", "not_known"):
         refuses(ConfigError, f"has no column {name!r}", ColumnReader, path, name)
-
-
-def _damage(rng, whole, points_at):
-    data = bytearray(whole)
-    for _ in range(rng.choice([1, 2, 5])):
-        at = rng.randrange(len(data)) if rng.random() < 0.5 else rng.randrange(points_at + 100)
-        width = rng.choice([1, 2, 4, 8])
-        data[at : at + width] = rng.choice([b"\xff" * width, bytes(width), rng.randbytes(width)])
-    return data[: rng.randrange(len(data))] if rng.random() < 0.1 else data
-
-
-@pytest.mark.parametrize("name", ["1.laz", "3.las", "6.laz", "8.las", "10.laz"])
-def test_damaged_clouds_read_or_are_refused(tmp_path, name):
-    rng = random.Random(name)
-    path = tmp_path / name
-    if path.stem == "10":
-        make_raw(100, point_format=10).write(path)
-    else:
-        write_cloud(path, int(path.stem), extra=("amplitude", "echo_flags"))
-    whole = path.read_bytes()
-    outcomes = []
-    for _ in range(60):
-        path.write_bytes(_damage(rng, whole, int.from_bytes(whole[96:100], "little")))
-        outcomes.append(read_all(path) is None)
-    assert True in outcomes and False in outcomes
 
 
 def test_numbers_of_points_that_no_file_could_hold_are_refused_at_once(tmp_path):

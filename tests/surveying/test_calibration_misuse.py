@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from commands import fail, refuses, succeed
 from commands import run_command as call
+from strips import add_record, place_header
 
 import wavebatch as wb
 from tests import footprints
@@ -36,6 +37,7 @@ from tests.facet_strips import (
 from tests.footprints import Flight, Plane
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import Digitizer, SystemPulse
+from wavebatch.files.las.header import Vlr
 from wavebatch.files.strip.reader import PairScale, StripReader
 from wavebatch.kernels.physics.radiometry import attenuation_of_visibility, judge_energies
 from wavebatch.surveying import sensor
@@ -321,7 +323,7 @@ def test_the_rate_of_pulses_is_that_of_most(rng, kept, share, after):
     assert setting._measure_rate(reader) == pytest.approx(1e5, rel=0.02)
 
 
-def test_thinned_points_over_ground_in_common_are_no_other_rate_of_pulses(tmp_path, calibrated, rng):
+def test_thinned_points_over_ground_in_common_are_no_other_rate_of_pulses(calibrated):
     """An eighth of the pulses had an error of 208 %, and a random tenth one of 42 %, as of another energy."""
     with StripReader(calibrated / "a.las") as strip, strip.scan() as scan:
         source = sensor.find_sensor(strip, scan, sensor.SensorRequest())
@@ -749,34 +751,21 @@ def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated)
     assert found[0.0][0] < 0.035 < found[0.3][0] - 0.015, found
 
 
-def move_points(path, target, move):
-    """The strip with its points moved, f8 (n, 3) to f8 (n, 3), and its packet vectors left as they are."""
-    content = bytearray(path.read_bytes())
-    (begin,), (number,) = struct.unpack_from("<I", content, 96), struct.unpack_from("<I", content, 107)
-    (length,) = struct.unpack_from("<H", content, 105)
-    scale, offset = np.array(struct.unpack_from("<6d", content, 131)).reshape(2, 3)
-    rows = np.frombuffer(content, np.uint8, number * length, begin).reshape(number, length).copy()
-    xyz = move(np.ascontiguousarray(rows[:, :12]).view("<i4") * scale + offset)
-    rows[:, :12] = np.ascontiguousarray(np.rint((xyz - offset) / scale).astype("<i4")).view(np.uint8)
-    content[begin : begin + rows.size] = rows.tobytes()
-    struct.pack_into("<6d", content, 179, *np.stack([xyz.max(axis=0), xyz.min(axis=0)], axis=1).ravel())
-    target.write_bytes(content)
-
-
-def turn(xyz, degrees=2.0):
-    east, north = (xyz[:, :2] - xyz[:, :2].mean(axis=0)).T
+def turn(points, degrees=2.0):
+    """Points turned about their middle, while their packet vectors stay as they are."""
+    middle = points["X"].mean(), points["Y"].mean()
+    east, north = points["X"] - middle[0], points["Y"] - middle[1]
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    middle = xyz[:, :2].mean(axis=0)
-    return np.column_stack([c * east - s * north + middle[0], s * east + c * north + middle[1], xyz[:, 2]])
+    points["X"], points["Y"] = np.rint([c * east - s * north + middle[0], s * east + c * north + middle[1]])
 
 
 @pytest.mark.quick_cases("0.4")
 @pytest.mark.parametrize("slope", [0.0, 0.4])
-def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, slope):
+def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, edit_points, slope):
     """They had no range, for want of a sensor; and with --flight-height one that no hillside entered the error of."""
     high = replace(SENSOR, height=900.0)
     write_strip(tmp_path / "s.las", [Facet(0.3, slope=(0.0, slope))], high, 6000, seed=85)
-    move_points(tmp_path / "s.las", tmp_path / "turned.las", turn)
+    edit_points(tmp_path / "s.las", tmp_path / "turned.las", turn)
     done = call("run", tmp_path / "turned.las", "-o", tmp_path / "a", "--columns", "range,range_error")
     assert done.exit_code == 0 and "vectors spread by 24 degrees, but do not meet in a path" in done.stderr
     assert "RuntimeWarning" not in done.output
@@ -1038,15 +1027,12 @@ def test_a_shuffled_log_of_energies_is_refused(tmp_path, rng):
 
 def test_degrees_without_a_crs_are_named(tmp_path):
     write_strip(tmp_path / "s.las", FARMLAND, SENSOR, 400)
-    content = bytearray((tmp_path / "s.las").read_bytes())
-    struct.pack_into("<3d", content, 131, 1e-8, 1e-8, 1e-3)
-    struct.pack_into("<3d", content, 155, 11.0, 48.0, 0.0)
-    struct.pack_into("<6d", content, 179, 11.003, 10.999, 48.004, 47.996, 1.0, -1.0)
-    (tmp_path / "s.las").write_bytes(content)
+    bounds = (11.003, 10.999, 48.004, 47.996, 1.0, -1.0)
+    place_header(tmp_path / "s.las", lambda _: (1e-8, 1e-8, 1e-3, 11.0, 48.0, 0.0, *bounds))
     fail(4, "coordinates look like degrees", "run", tmp_path / "s.las", "-o", tmp_path / "out", "--columns", "range")
 
 
-def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, calibrated, monkeypatch):
+def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(calibrated, monkeypatch):
     monkeypatch.setattr(sensor, "measure_scale", lambda reader, scan: PairScale(3.281))
     metres = SimpleNamespace(is_metric=True, horizontal=1.0)
     with StripReader(calibrated / "a.las") as reader, reader.scan() as scan:
@@ -1059,11 +1045,7 @@ def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, ca
 def test_feet_without_pairs_of_returns_are_said(tmp_path, calibrated):
     """Light 10.8 times too bright was put down to another gain or other surfaces."""
     write_strip(tmp_path / "s.las", FARMLAND, replace(SENSOR, time=START + 600), 8000, seed=81)
-    content = bytearray((tmp_path / "s.las").read_bytes())
-    for at, number in ((131, 3), (155, 3), (179, 6)):  # scales, offsets, extent
-        values = np.array(struct.unpack_from(f"<{number}d", content, at)) / 0.3048
-        struct.pack_into(f"<{number}d", content, at, *values)
-    (tmp_path / "s.las").write_bytes(content)
+    place_header(tmp_path / "s.las", lambda metres: metres / 0.3048)
     columns = "backscatter_coefficient,backscatter_coefficient_err"
     line = run(calibrated, tmp_path / "out", tmp_path / "s.las", "--columns", columns)
     assert "or coordinates in feet (which make it 10.8 times as bright)" in line
@@ -1074,14 +1056,7 @@ def test_feet_without_pairs_of_returns_are_said(tmp_path, calibrated):
 
 def name_crs(path, code):
     """The strip again with the GeoTIFF key of a projected CRS."""
-    content = bytearray(path.read_bytes())
-    keys = struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, code)
-    record = struct.pack("<H16sHH32s", 0, b"LASF_Projection", 34735, len(keys), b"") + keys
-    begin, number = struct.unpack_from("<2I", content, 96)
-    struct.pack_into("<2I", content, 96, begin + len(record), number + 1)
-    (packets,) = struct.unpack_from("<Q", content, 227)
-    struct.pack_into("<Q", content, 227, packets + len(record))
-    path.write_bytes(content[:begin] + record + content[begin:])
+    add_record(path, Vlr(b"LASF_Projection", 34735, struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, code)))
 
 
 @pytest.mark.parametrize("stretch", [1.5, 0.97, 1.0])

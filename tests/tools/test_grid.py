@@ -2,7 +2,6 @@
 
 import json
 import os
-import struct
 import subprocess
 import sys
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 from commands import run_command, succeed
+from strips import place_header
 from writer_tools import write_points
 
 from wavebatch.files.las.crs import read_crs_definition
@@ -233,10 +233,7 @@ def test_a_full_disk_is_one_line_without_those_of_gdal(rng, tmp_path):
 def test_cells_in_metres_are_refused_on_degrees(rng, tmp_path):
     degrees = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],UNIT["degree",0.0174532925]]'
     _cloud(tmp_path / "d.las", rng, wkt=degrees)
-    content = bytearray((tmp_path / "d.las").read_bytes())
-    struct.pack_into("<6d", content, 131, 1e-8, 1e-8, 0.001, 15.0, 48.0, 0.0)
-    struct.pack_into("<6d", content, 179, 15.1, 15.0, 48.1, 48.0, 1.0, 0.0)
-    (tmp_path / "d.las").write_bytes(content)
+    place_header(tmp_path / "d.las", lambda _: (1e-8, 1e-8, 0.001, 15, 48, 0, 15.1, 15, 48.1, 48, 1, 0))
     words = (tmp_path / "d.las", "--column", "height", "-o", tmp_path / "d.tif")
     assert "coordinates are degrees, and cells of 1 degrees are larger" in _run(*words, code=2).stderr
     _run(*words, "--size", "1e-05")

@@ -2,12 +2,11 @@
 
 import json
 import re
-import shutil
-import struct
 
+import numpy as np
 import pytest
 from commands import refuses, run_command, succeed
-from strips import add_record
+from strips import add_record, place_header
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.crs import build_utm
@@ -30,14 +29,7 @@ def clouds(tiny_strip, tmp_path_factory):
     metres = folder / tiny_strip.name
     found = {"m": metres}
     for name, wkt, factor in (("ft", FEET, 1 / FOOT), ("deg", DEGREES, 1.0)):
-        found[name] = folder / f"{name}.las"
-        content = bytearray(metres.read_bytes())
-        for place in (131, 155):  # scales and offsets
-            values = struct.unpack_from("<3d", content, place)
-            struct.pack_into("<3d", content, place, *(value * factor for value in values))
-        extent = struct.unpack_from("<6d", content, 179)
-        struct.pack_into("<6d", content, 179, *(value * factor for value in extent))
-        found[name].write_bytes(content)
+        found[name] = place_header(metres, lambda old, factor=factor: old * factor, folder / f"{name}.las")
         add_record(found[name], build_wkt(wkt))
     return found
 
@@ -62,13 +54,9 @@ def test_distances_of_returns_are_metres(clouds):
     assert area["mean"] == pytest.approx(metres["separations"]["all"]["mean"], rel=1e-6)
 
 
-def test_clouds_in_feet_are_compared_in_metres(clouds):
-    shifted = clouds["ft"].with_name("shifted.las")
-    shutil.copy(clouds["ft"], shifted)
-    content = bytearray(shifted.read_bytes())
-    (height,) = struct.unpack_from("<d", content, 171)
-    struct.pack_into("<d", content, 171, height + 0.1)  # 0.1 ft are 0.2 ns; as metres they would be 0.67 ns
-    shifted.write_bytes(content)
+def test_clouds_in_feet_are_compared_in_metres(clouds, tmp_path):
+    # 0.1 ft are 0.2 ns; as metres they would be 0.67 ns
+    shifted = place_header(clouds["ft"], lambda old: old + 0.1 * (np.arange(12) == 5), tmp_path / "shifted.las")
     found = json.loads(_print("compare", clouds["ft"], shifted, "--within", 0.3, "--json").stdout)
     assert found["identical"] == 1.0
     line = _print("compare", clouds["deg"], clouds["deg"], code=2).stderr
@@ -84,10 +72,7 @@ def test_the_summary_of_a_map_names_the_unit(clouds, tmp_path):
 def test_packet_vectors_in_metres_do_not_place_echoes_in_feet(named, tmp_path):
     """The spacing of the returns shows it, with a CRS and without: added echoes were metres from their place."""
     simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)
-    content = bytearray((tmp_path / "strip.las").read_bytes())
-    for place in (131, 155):
-        struct.pack_into("<3d", content, place, *(one / FOOT for one in struct.unpack_from("<3d", content, place)))
-    (tmp_path / "strip.las").write_bytes(content)
+    place_header(tmp_path / "strip.las", lambda old: old / FOOT)
     if named:
         add_record(tmp_path / "strip.las", build_wkt(FEET))
     line = _print("run", tmp_path / "strip.las", "-o", tmp_path / "o", "--profile", "fast", code=4).stderr
