@@ -9,7 +9,7 @@ import laspy
 import naive
 import numpy as np
 import pytest
-from commands import fail, refuses, run_command
+from commands import refuses, run_command
 from writer_tools import number_returns, write_points
 
 from wavebatch.cli.compare import HEAD, list_rows
@@ -397,7 +397,6 @@ def test_rows_are_the_figures_of_the_document(tmp_path, tiny_strip):
             assert int(rows["number"]) == spread["number"]
             assert float(rows["mean"]) == pytest.approx(spread["mean"])
     assert not any("(" in value for value in found.values())
-    fail(2, "--overwrite", "compare", "fast", "balanced", "--strip", tiny_strip, "--limit", 200, "-o", target)
 
 
 def test_no_data_is_an_empty_cell():
