@@ -62,8 +62,8 @@ COMMANDS = {
 
 SIGNALS: dict[str, tuple[int, ...]] = {
     "INT": (signal.SIGINT,), "TERM": (signal.SIGTERM,), "HUP": (signal.SIGHUP,), "KILL": (signal.SIGKILL,),
-    "INT INT": (signal.SIGINT, signal.SIGINT), "TERM INT TERM": (signal.SIGTERM, signal.SIGINT, signal.SIGTERM),
-    "INT KILL": (signal.SIGINT, signal.SIGKILL),
+    "XCPU": (signal.SIGXCPU,), "INT INT": (signal.SIGINT, signal.SIGINT), "INT KILL": (signal.SIGINT, signal.SIGKILL),
+    "TERM INT TERM": (signal.SIGTERM, signal.SIGINT, signal.SIGTERM),
 }  # fmt: skip
 WORKERS = ("worker KILL", "worker STOP CONT", "worker STOP INT", "worker STOP KILL")
 ATTACKS = (*SIGNALS, "group INT", "group TERM", *WORKERS)
@@ -166,7 +166,7 @@ class Attacker:
     def _disturb(self, process: subprocess.Popen, attack: Attack) -> tuple[bool, int | str, str]:
         """Send the signals; whether the process had begun, and its exit code or "hangs", and stderr."""
         time.sleep(attack.share * self.seconds[attack.name])
-        is_ready = _handles_signals(process.pid)
+        is_ready = handles_signals(process.pid)
         target, _, rest = attack.kind.partition(" ")
         with contextlib.suppress(ProcessLookupError):
             if target == "worker":
@@ -184,10 +184,9 @@ class Attacker:
         return is_ready, process.returncode, said
 
     def _disturb_worker(self, parent: int, actions: list[str]) -> None:
-        children = map(int, _read_process(parent, f"task/{parent}/children").split())
-        workers = [pid for pid in children if "spawn_main" in _command_line(pid)]
+        workers = [pid for pid in list_children(parent) if "spawn_main" in command_line(pid)]
         if actions == ["STOP", "KILL"]:  # one that is stopped while Python starts in it cannot be woken
-            workers = [pid for pid in workers if _has_signal(pid, "SigIgn", signal.SIGINT)]
+            workers = [pid for pid in workers if has_signal(pid, "SigIgn", signal.SIGINT)]
         if not workers:
             return
         worker = random.choice(workers)
@@ -201,7 +200,7 @@ class Attacker:
         deadline = time.monotonic() + self.stay
         while (left := _session(process.pid)) and time.monotonic() < deadline:
             time.sleep(0.01)
-        found = [_command_line(pid) for pid in left]
+        found = [command_line(pid) for pid in left]
         for pid in left:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -317,19 +316,19 @@ def _without_times(value: object) -> object:
     return [_without_times(one) for one in value] if isinstance(value, list) else value
 
 
-def _handles_signals(pid: int) -> bool:
+def handles_signals(pid: int) -> bool:
     """Whether the program has begun: from then on no signal may be lost."""
-    return _has_signal(pid, "SigCgt", signal.SIGTERM)
+    return has_signal(pid, "SigCgt", signal.SIGTERM)
 
 
-def _has_signal(pid: int, name: str, number: int) -> bool:
+def has_signal(pid: int, name: str, number: int) -> bool:
     """Whether a signal is among those that a process catches (name SigCgt) or ignores (SigIgn); True if it is gone."""
-    lines = _read_process(pid, "status").decode().splitlines()
+    lines = read_process(pid, "status").decode().splitlines()
     signals = [int(line.split()[1], 16) for line in lines if line.startswith(name)]
     return not signals or bool(signals[0] >> (number - 1) & 1)
 
 
-def _read_process(pid: int | str, name: str) -> bytes:
+def read_process(pid: int | str, name: str) -> bytes:
     """What Linux says of a process; nothing if it is gone."""
     try:
         return Path(f"/proc/{pid}/{name}").read_bytes()
@@ -349,14 +348,18 @@ def has_not_begun(is_ready: bool, code: int | str, said: str) -> bool:
     return code < 0 or (code == 1 and "KeyboardInterrupt" in said and f'File "{_PACKAGE}' not in said)
 
 
-def _command_line(pid: int) -> str:
-    return _read_process(pid, "cmdline").replace(b"\0", b" ").decode(errors="replace")[:200]
+def list_children(pid: int) -> list[int]:
+    return [int(word) for word in read_process(pid, f"task/{pid}/children").split()]
+
+
+def command_line(pid: int) -> str:
+    return read_process(pid, "cmdline").replace(b"\0", b" ").decode(errors="replace")[:200]
 
 
 def _stacks(process: subprocess.Popen) -> str:
     """The processes that hang, and where the threads of the first one are, as faulthandler writes it."""
     others = [pid for pid in _session(process.pid) if pid != process.pid]
-    said = "; ".join(map(_command_line, others))
+    said = "; ".join(map(command_line, others))
     for pid in others:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -370,7 +373,7 @@ def _session(number: int) -> list[int]:
     """Living processes of a session."""
     found = []
     for name in filter(str.isdigit, os.listdir("/proc")):
-        state, _, _, session = (_read_process(name, "stat").rpartition(b")")[2].split() or [b"X"] * 4)[:4]
+        state, _, _, session = (read_process(name, "stat").rpartition(b")")[2].split() or [b"X"] * 4)[:4]
         if session == b"%d" % number and state not in b"ZX":
             found.append(int(name))
     return found

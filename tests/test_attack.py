@@ -37,7 +37,7 @@ class Planted(Attacker):
     def _start(self, *places):
         """The process, once it does not die of the signal: on a busy machine that takes a while."""
         process, deadline = super()._start(*places), time.monotonic() + 300
-        while process.poll() is None and not attacking._handles_signals(process.pid):
+        while process.poll() is None and not attacking.handles_signals(process.pid):
             assert time.monotonic() < deadline, "the program does not begin"
             time.sleep(0.01)
         return process

@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+from attacking import command_line, has_signal, list_children
 from batch_tools import is_alive, read_outputs
 from commands import run_command
 
@@ -82,17 +83,9 @@ def _disturb(strips, out, event, number):
     return done.returncode, done.stderr
 
 
-def _children(pid):
-    with open(f"/proc/{pid}/task/{pid}/children") as file:
-        return [int(word) for word in file.read().split()]
-
-
-def _is_tracker(pid):
-    try:
-        with open(f"/proc/{pid}/cmdline", "rb") as file:
-            return b"resource_tracker" in file.read()
-    except OSError:
-        return False
+def _list_workers(pid):
+    """Without the process that tracks resources, which ends when all others have."""
+    return [child for child in list_children(pid) if "resource_tracker" not in command_line(child)]
 
 
 @pytest.mark.quick_cases("300-event1")
@@ -126,7 +119,7 @@ def test_workers_die_with_their_parent(strips, tmp_path, stopped):
     command = _stage(strips, tmp_path / "out", tmp_path / "run.py", act, "--jobs", "2", **DRAWN_UP)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "at work\n"
-        children = [child for child in _children(process.pid) if not _is_tracker(child)]  # it ends when all others have
+        children = _list_workers(process.pid)
         assert len(children) == 2
         for child in children if stopped else ():
             os.kill(child, signal.SIGSTOP)
@@ -140,12 +133,6 @@ def _wait_until_gone(children):
     while any(is_alive(child) for child in children):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.01)
-
-
-def _ignores_ctrl_c(pid):
-    with open(f"/proc/{pid}/status") as file:
-        ignored = next(int(line.split()[1], 16) for line in file if line.startswith("SigIgn"))
-    return bool(ignored >> (signal.SIGINT - 1) & 1)
 
 
 _WAITS = """
@@ -170,8 +157,8 @@ def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_p
         worker = None
         while worker is None:
             assert process.poll() is None
-            workers = [child for child in _children(process.pid) if not _is_tracker(child)]
-            worker = next(filter(_ignores_ctrl_c, workers), None)
+            workers = _list_workers(process.pid)
+            worker = next((one for one in workers if has_signal(one, "SigIgn", signal.SIGINT)), None)
         os.kill(worker, signal.SIGSTOP)
         process.send_signal(signal.SIGKILL)
     _wait_until_gone([worker])

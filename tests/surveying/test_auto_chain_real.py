@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers_scenes import survey_file
 
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
@@ -88,13 +87,3 @@ def test_leica(leica):
     assert (found.returns == 1).all()
     assert (found.echoes == 1).mean() >= 0.97
     assert found.matched.mean() >= 0.995
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("strip", ["riegl", "leica"])
-def test_the_chain_of_a_real_strip_is_the_same_every_time(strip, request):
-    path = request.getfixturevalue(strip)
-    chosen = []
-    for _ in range(2):
-        chosen.append(survey_file(path))
-    assert chosen[0] == chosen[1]

@@ -463,18 +463,6 @@ def test_other_ground_and_ground_that_has_changed_show_no_energy(rng, other):
 
 
 @pytest.mark.slow
-def test_a_strip_beside_the_calibrated_one_shows_another_energy_by_common_ground(tmp_path, calibrated):
-    """Fields of 20 m are too large for scenes of so small strips to be alike."""
-    for light, seed in ((1.0, 5), (0.8, 6)):
-        beside = replace(SENSOR, light=light * LIGHT, start=(0.0, 150.0), time=START + 600)
-        write_strip(tmp_path / "b.las", FARMLAND, beside, 10_000, seed=seed)
-        said = run(calibrated, tmp_path / f"out{seed}", tmp_path / "b.las")
-        stated = state_error(tmp_path / f"out{seed}" / "b.laz")
-        assert ("ground in common is alike" in said) == (light != 1.0)
-        assert stated < 0.06 if light == 1.0 else 0.2 < stated < 0.35
-
-
-@pytest.mark.slow
 def test_noise_that_grows_with_the_light_names_a_gain_over_another_landscape(tmp_path, calibrated):
     bright = [Facet(lambda x, y: 0.2 + 0.3 * np.abs(np.sin(0.3 * x)) ** 0.3)]
     said = {}
@@ -736,21 +724,6 @@ def test_other_surfaces_at_two_wavelengths_are_no_constants_of_another_channel(r
     assert not lines and 0.1 < growth < 0.35
 
 
-@pytest.mark.slow
-def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated):
-    text = (calibrated / "cal.toml").read_text()
-    assert "\nchange_chance = 0.3" in text
-    write_strip(tmp_path / "s.las", FARMLAND, replace(SENSOR, time=START + 600, start=(3000, 0)), 10_000, seed=83)
-    found = {}
-    for chance in (0.3, 0.0):
-        (tmp_path / "cal.toml").write_text(text.replace("change_chance = 0.3", f"change_chance = {chance}"))
-        said = run(tmp_path, tmp_path / "out", "s.las", "--attenuation", 0.22)
-        stated = state_error(tmp_path / "out" / "s.laz")
-        found[chance] = stated, "an assumed chance of 30% (change_chance)" in said
-    assert found[0.3][1] and not found[0.0][1]
-    assert found[0.0][0] < 0.035 < found[0.3][0] - 0.015, found
-
-
 def turn(points, degrees=2.0):
     """Points turned about their middle, while their packet vectors stay as they are."""
     middle = points["X"].mean(), points["Y"].mean()
@@ -840,6 +813,7 @@ def test_scanner_channels_of_one_digitizer_are_compared_one_by_one(tmp_path):
 
 def test_a_constant_without_an_error_is_named(tmp_path, calibrated):
     text = (calibrated / "cal.toml").read_text()
+    assert "\nchange_chance = 0.3" in text  # the default is written, so that it can be changed
     error = load_calibration(calibrated / "cal.toml").relative_error
     (tmp_path / "cal.toml").write_text(text.replace(f"relative_error = {error!r}", "relative_error = 0.0"))
     done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", tmp_path / "cal.toml")
