@@ -85,9 +85,9 @@ LEAST_QUIET_PAIRS = 100
 CHANCE = 3.0
 """Standard errors up to which a covariance is none: those of many lags add up in the noise of a wide pulse."""
 
-MOST_SLOW, ALIKE_SHAPE = 0.92, 2.5
-"""Most correlation of neighbours in noise that is followed beyond the lags that are seen; and how far its variogram may
-be from that shape, over the last value and the root of the pairs."""
+MOST_SLOW, BENDS = 0.92, (1.0, 1.5, 2.0)
+"""Most correlation of neighbours in noise of one pole that is followed beyond the lags that are seen: its length, 12
+samples, is also the most of others. And the powers of its shapes: one pole, a receiver's bell, and between them."""
 
 HIGH, SKEWED = 2.0, 1.15
 """Standard deviations above the level from which quiet samples may be an echo, and how much larger than by samples
@@ -430,9 +430,13 @@ def measure_covariance(
     sill = float(np.average(half[far:], weights=pairs[far:]))
     rest = sill - np.array(half)
     chance = CHANCE * sill / np.sqrt(pairs)
-    if len(half) >= RISE and pairs[-1] >= LEAST_PAIRS:
-        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), signal, quiet, (1 + SETTLED) * sill)
-        if slow is not None:
+    # Runs that reach each lag: differences of one run are no more than one.
+    runs = np.maximum(-np.diff([*pairs, found[len(half)][0] if len(found) > len(half) else 0.0]), 1.0)
+    rises = half[-1] - half[max(far - 1, 0)] > CHANCE * half[-1] * np.sqrt(2 / runs[-1])
+    if rises and len(half) >= RISE and pairs[-1] >= LEAST_PAIRS:
+        variance = float(np.var(signal[quiet], dtype=np.float64))
+        slow = _extend(np.array(half), runs, max(lags, len(half)), variance)
+        if slow[0] > (1 + SETTLED) * sill:
             return slow
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
 
@@ -452,28 +456,35 @@ def _pair_differences(quiet: np.ndarray, marks: np.ndarray | None, lag: int, las
     return every.tolist()
 
 
-def _extend(
-    half: np.ndarray, pairs: np.ndarray, lags: int, signal: np.ndarray, quiet: np.ndarray, least: float
-) -> np.ndarray | None:
-    """Covariance (1 + lags,) of noise that forgets itself by one factor a sample, from a variogram that is too short.
+def _extend(half: np.ndarray, runs: np.ndarray, lags: int, most: float) -> np.ndarray:
+    """Covariance (1 + lags,) of noise whose variogram rises as far as it is seen: runs of quiet samples are too short.
 
-    Its sill is what the variogram tends to, and at most the variance of all quiet samples, with that of their levels.
-    None where no such noise has this variogram, or none whose sill is above `least`.
+    Of shapes exp(-(k/l)^p) each counts as likely as it is; what levels of waveforms differ by may be such noise, so
+    that the sill is at most the variance of all quiet samples.
+
+    Parameters
+    ----------
+    half : float64 (k,)
+        Variogram at lags 1, 2, ... [count^2].
+    runs : float64 (k,)
+        Of quiet samples, by which each is known.
+    lags : int
+        k at least.
+    most : float
+        That variance [count^2].
     """
-    factor = np.linspace(0.0, MOST_SLOW, 50)
-    power = np.cumprod(np.repeat(factor[:, None], lags, axis=1), axis=1)
-    shape, slow = 1 - power[:, : len(half)], half - QUANTISATION_STD**2
-    size = np.einsum("fk,k->f", shape, slow * pairs) / np.einsum("fk,fk,k->f", shape, shape, pairs)
+    place = -log(np.linspace(1e-9, MOST_SLOW, 50))[:, None] * np.arange(1.0, lags + 1)
+    power = exp(-np.concatenate([exp(by * log(place)) for by in BENDS]))
+    shape, slow, weight = 1 - power[:, : len(half)], half - QUANTISATION_STD**2, runs / (2 * half**2)
+    size = np.einsum("fk,k->f", shape, slow * weight) / np.einsum("fk,fk,k->f", shape, shape, weight)
     rest = slow - size[:, None] * shape
-    best = int(np.argmin(np.einsum("fk,fk,k->f", rest, rest, pairs)))
-    if (np.abs(rest[best]) > ALIKE_SHAPE / np.sqrt(pairs) * slow[-1]).any():
-        return None
-    sill = float(size[best]) + QUANTISATION_STD**2
-    if sill > least:  # the variance of all takes longer than the rest
-        sill = min(sill, float(np.var(signal[quiet], dtype=np.float64)))
-    if sill <= least:
-        return None
-    return np.r_[sill, sill - half, max(sill - half[-1], 0.0) * power[best, : lags - len(half)]]
+    off = np.einsum("fk,fk,k->f", rest, rest, weight)
+    likely = exp(-0.5 * (off - off.min()))
+    likely /= likely.sum()
+    sill = float(np.einsum("f,f->", likely, np.minimum(size + QUANTISATION_STD**2, most)))
+    tail = np.einsum("f,fk->k", likely, power[:, len(half) - 1 :])
+    left = max(sill - float(half[-1]), 0.0)
+    return np.r_[sill, sill - half, left * tail[1:] / max(float(tail[0]), 1e-12)]
 
 
 def _smoothed_std(covariance: np.ndarray) -> float:
