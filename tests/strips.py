@@ -9,13 +9,22 @@ from pathlib import Path
 import lazrs
 import numpy as np
 
+from wavebatch.batch.job import StripJob
+from wavebatch.batch.options import RunOptions
 from wavebatch.files.las.header import STANDARD_DTYPES, Vlr, read_header
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.tools.simulate.render import AIR_SPEED, START_TIME, FlightLine, trace_rays
 
 HEADER_SIZES = {3: 235, 4: 375, 5: 393}
 TOWARD = np.array([0.02, -0.01, 0.148]) / 1000.0
 """Vector of every pulse toward the sensor [m/ps], 0.9997 of c/2 long or so."""
+
+
+def voxel_job(strip, *, system=None, force=False, energy=None, **more) -> StripJob:
+    """What `voxelize_strip` needs to know of a strip, for any survey of it; more: fields of StripJob."""
+    options, request = RunOptions(energy=energy), Request(auto=True, system=system, force=force)
+    return StripJob(Path(strip), widest_chain(), options, request=request, **more)
 
 
 def true_sensor(time: np.ndarray, flight: FlightLine | None = None) -> np.ndarray:

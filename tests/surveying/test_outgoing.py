@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import refuses
+from strips import voxel_job
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
@@ -219,7 +220,7 @@ def test_voxels_are_divided_by_the_energies(strip, tmp_path):
     path, energies = strip
     sums = {}
     for energy in (None, "none"):
-        voxelize_strip(path, tmp_path / f"{energy}.npz", VoxelOptions(size=0.3, energy=energy))
+        voxelize_strip(voxel_job(path, energy=energy), tmp_path / f"{energy}.npz", VoxelOptions(size=0.3))
         with np.load(tmp_path / f"{energy}.npz") as found:
             column = found["index"][:, 0]
             sums[energy] = np.bincount(column - column.min(), found["energy"])

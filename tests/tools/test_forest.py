@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import refuses, run_command, succeed
 from forest_scenes import fly, grow
+from strips import voxel_job
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
@@ -29,7 +30,7 @@ QUICK = Deconvolution(iterations=2)
 
 def voxelize(strip, target, ratio=None):
     options = VoxelOptions(1.0, forest=True, reflectance_ratio=ratio)
-    voxelize_strip(strip, target, options, system=SAVED, force=True, overwrite=True)
+    voxelize_strip(voxel_job(strip, system=SAVED, force=True), target, options, overwrite=True)
     return target
 
 
@@ -96,7 +97,8 @@ def test_ground_that_slopes_within_footprints_is_named(tmp_path, slope, height, 
     sensor = SensorRequest(height=1000.0)
     options = VoxelOptions(1.0, QUICK, forest=True, ground_height=height)
     saved = replace(SAVED, survey=survey)
-    summary = voxelize_strip(tmp_path / "s.las", tmp_path / "v.laz", options, system=saved, sensor=sensor, force=True)
+    job = voxel_job(tmp_path / "s.las", system=saved, sensor=sensor, force=True)
+    summary = voxelize_strip(job, tmp_path / "v.laz", options)
     lines = [line for line in summary.warnings if "ground in footprints of" in line]
     assert len(lines) == named
     if named:
@@ -108,7 +110,7 @@ def test_ground_that_slopes_within_footprints_is_named(tmp_path, slope, height, 
 def test_roofs_are_no_slopes_of_the_ground(tmp_path):
     """Roofs that fill cells of the map are the lowest returns there: a level village had slopes of 32 degrees."""
     simulate_strip("village", tmp_path / "s.las", pulses=4000)
-    summary = voxelize_strip(tmp_path / "s.las", tmp_path / "v.laz", VoxelOptions(1.0, QUICK, forest=True))
+    summary = voxelize_strip(voxel_job(tmp_path / "s.las"), tmp_path / "v.laz", VoxelOptions(1.0, QUICK, forest=True))
     assert summary.voxels and not [line for line in summary.warnings if "slopes" in line]
 
 
@@ -136,7 +138,8 @@ def test_gaps_that_wide_footprints_hide_are_in_the_error(tmp_path, footprint):
     system = SAVED.survey.system.with_radiometry(divergence=footprint)
     saved = replace(SAVED, survey=replace(SAVED.survey, system=system))
     options, sensor = VoxelOptions(1.0, forest=True), SensorRequest(height=1000.0)
-    voxelize_strip(tmp_path / "s.las", tmp_path / "v.laz", options, system=saved, sensor=sensor, force=True)
+    job = voxel_job(tmp_path / "s.las", system=saved, sensor=sensor, force=True)
+    voxelize_strip(job, tmp_path / "v.laz", options)
     _, found = measure(tmp_path / "v.laz", tmp_path)
     true = np.array([[leaves.area_index(x, y, CELL) for x in (0, 10)] for y in (10, 0)])
     off, error = found["leaf_area_index"] - true, found["leaf_area_index_err"]
@@ -149,7 +152,7 @@ def test_footprints_that_show_no_gaps_are_named_and_kept_with_the_voxels(tmp_pat
     system = SAVED.survey.system.with_radiometry(divergence=footprint)
     saved = replace(SAVED, survey=replace(SAVED.survey, system=system))
     target, sensor, options = tmp_path / "v.laz", SensorRequest(height=1000.0), VoxelOptions(1.0, QUICK, forest=True)
-    done = voxelize_strip(forest_strip, target, options, system=saved, sensor=sensor, force=True)
+    done = voxelize_strip(voxel_job(forest_strip, system=saved, sensor=sensor, force=True), target, options)
     lines = [line for line in done.warnings if line.startswith("leaf areas:")]
     assert len(lines) == bool(named) and (not named or f"footprints {named} " in lines[0])
     found = Forest([target], 10.0, ForestOptions())
@@ -215,13 +218,13 @@ def test_voxels_have_what_forests_need(even, tmp_path):
 
 def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
     plain = tmp_path / "plain.laz"
-    voxelize_strip(forest_strip, plain, VoxelOptions(1.0, QUICK), system=SAVED, force=True)
+    voxelize_strip(voxel_job(forest_strip, system=SAVED, force=True), plain, VoxelOptions(1.0, QUICK))
     refuses(ConfigError, "--forest needs voxels: wavebatch voxelize", Forest, [plain], 10.0, ForestOptions())
     for options, words in (
         (VoxelOptions(2.0, QUICK, forest=True), "has other voxels than .*, of --size 1"),
         (VoxelOptions(1.0, QUICK, forest=True, ground_height=0.9), "of --ground-height 0.5; give one"),
     ):
-        voxelize_strip(forest_strip, plain, options, system=SAVED, force=True, overwrite=True)
+        voxelize_strip(voxel_job(forest_strip, system=SAVED, force=True), plain, options, overwrite=True)
         refuses(ConfigError, words, Forest, [even[1], plain], 10.0, ForestOptions())
     refuses(ConfigError, "cells need 4 voxels along a side; give 4 or more", Forest, [even[1]], 3.0, ForestOptions())
     with pytest.raises(ConfigError, match="layers are thinner than the voxels, .*; give 1 or more"):

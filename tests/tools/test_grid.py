@@ -15,7 +15,7 @@ from writer_tools import write_points
 
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
-from wavebatch.tools.cells import STATISTICS, compute_cells, grid_values
+from wavebatch.tools.cells import compute_cells, grid_values
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # inside rasterio
 
@@ -57,7 +57,7 @@ def _naive(statistic, values, area):
     return np.std(values, ddof=1) if statistic == "std" else getattr(np, statistic)(values)
 
 
-@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("statistic", ["mean", "median", "min", "max", "std", "count", "density"])
 def test_every_statistic_equals_its_definition(rng, statistic):
     cell, values = rng.integers(0, 50, 300), rng.normal(1e6, 1, 300)
     values[rng.random(300) < 0.2] = np.nan

@@ -263,7 +263,7 @@ def test_the_level_is_that_without_signal_where_signal_fills_most_of_the_wavefor
     samples = np.full((3, 100), 12, np.uint8)
     samples[:, 100 - round(100 * filled) :] = 60
     block = WaveformBlock.from_samples(samples, bits=8, spacing=1.0)
-    values = segments._shape(block).values.reshape(3, 100)
+    values = segments._shape(block)[1]["value"].reshape(3, 100)
     assert values[:, 0].tolist() == [0.0] * 3 and values[:, -1].tolist() == [48.0] * 3
 
 
@@ -309,7 +309,7 @@ def test_fill_between_recordings_is_no_sample():
     missing = np.zeros((5, 60), bool)
     missing[:, 30:40] = True
     block = replace(WaveformBlock.from_samples(samples, bits=8, spacing=2.0), missing=missing)
-    line = segments._build_line(0, segments._shape(block))
+    line = segments._build_line(0, *segments._shape(block))
     assert len(line.value) == 5 * 50 and sorted(set(line.time)) == [2.0 * k for k in range(60) if not 30 <= k < 40]
 
 

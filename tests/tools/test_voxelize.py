@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from commands import refuses
 from packet_strips import LENGTHS, draw_canopy, record, render, write_recorded
+from strips import voxel_job
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C, SQRT_2PI
@@ -90,9 +91,16 @@ def load(path):
         return {name: file[name] for name in file}
 
 
+def take_job(strip, options, saved):
+    """The job of a strip with those of the options that are its own, which are taken out."""
+    names = ("calibration", "sensor", "unit_points", "selection")
+    known = {name: options.pop(name) for name in names if name in options}
+    return voxel_job(strip, system=options.pop("system", saved), force=True, **known)
+
+
 def voxelize(strip, target, size, *, headroom=None, all_crossed=False, deconvolution=None, ratio=None, **options):
     settings = VoxelOptions(size, deconvolution or Deconvolution(), headroom, all_crossed, reflectance_ratio=ratio)
-    summary = voxelize_strip(strip, target, settings, system=options.pop("system", SAVED), force=True, **options)
+    summary = voxelize_strip(take_job(strip, options, SAVED), target, settings, **options)
     return summary, load(target) if target.suffix == ".npz" else laspy.read(target)
 
 
@@ -582,8 +590,11 @@ def test_memory_does_not_grow_with_the_strip(tmp_path):
         script = f"""
             from pathlib import Path
             from wavebatch.tools.bench.command import peak_memory
+            from wavebatch.batch.job import StripJob
+            from wavebatch.surveying.choose_chain import Request, widest_chain
             from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
-            voxelize_strip(Path({str(strip)!r}), Path({str(strip)!r}).with_suffix(".npz"), VoxelOptions(0.25))
+            job = StripJob(Path({str(strip)!r}), widest_chain(), request=Request(auto=True))
+            voxelize_strip(job, job.path.with_suffix(".npz"), VoxelOptions(0.25))
             print(peak_memory())
         """
         result = subprocess.run(
@@ -644,10 +655,11 @@ N = 1500
 
 
 def voxelize_pulses(strip, folder, *, how=None, size=1.0, ratio=2.0, where=None, **options):
-    chosen = PointFilter.build(where=where)
+    options["selection"] = PointFilter.build(where=where)
+    job = take_job(strip, options, QUIET)
     how = how or Deconvolution()
-    settings = VoxelOptions(size, how, headroom=50.0, reflectance_ratio=ratio, all_crossed=True, selection=chosen)
-    summary = voxelize_strip(strip, folder / "v.npz", settings, system=QUIET, force=True, overwrite=True, **options)
+    settings = VoxelOptions(size, how, headroom=50.0, reflectance_ratio=ratio, all_crossed=True)
+    summary = voxelize_strip(job, folder / "v.npz", settings, overwrite=True, **options)
     with np.load(folder / "v.npz") as file:
         return summary, {name: file[name] for name in file}
 

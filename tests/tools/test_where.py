@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from batch_tools import run_one
 from commands import fail, run_command, succeed
+from strips import voxel_job
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnReader
@@ -67,8 +68,8 @@ def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path, edit_p
         order = lambda points: points[np.argsort(points["bit_fields"] & 7, kind="stable")]  # noqa: E731
         strip = edit_points(tiny_strip, tmp_path / "s.las", order)
     whole, several, single, second, none = (
-        voxelize_strip(strip, tmp_path / f"{number}.npz", unit_points=unit_points, options=VoxelOptions(
-            2.0, Deconvolution(iterations=2), selection=PointFilter.build(where=where)))
+        voxelize_strip(voxel_job(strip, unit_points=unit_points, selection=PointFilter.build(where=where)),
+                       tmp_path / f"{number}.npz", VoxelOptions(2.0, Deconvolution(iterations=2)))
         for number, where in enumerate((None, "number_of_returns >= 2", "number_of_returns < 2", "return_number == 2",
                                         "z > 1e6"))
     )  # fmt: skip

@@ -22,7 +22,6 @@ from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, plan_filter, plan_layout
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.report_file import find_remarks, find_warnings
 from wavebatch.batch.unit import Packing, Prepared, UnitResult, pack_chunk, prepare_strip, process_unit, scan_run
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError, StageError
@@ -226,7 +225,7 @@ class StripTask:
         if self.job.options.format == "laz":
             self._packing.add(made.rows)
         else:
-            rows = made.rows.read(0, len(made.rows))
+            rows = made.rows.read(0)
             writer.append(Chunk(len(rows), rows.view(np.uint8)))
             made.rows.close()
         self._report += made.report + RunReport(timing={"write": Seconds.now() - start})
@@ -256,7 +255,7 @@ class StripTask:
         options, job, prepared, writer = self._options, self.job, self.ready, _given(self._writer)
         start = Seconds.now()
         self._report.check(job.options.points, str(job.path))
-        remarks, missed = find_remarks(prepared, self._report)
+        remarks, missed = report_file.find_remarks(prepared, self._report)
         if prepared.stranger:
             words = "does not belong to the flight that was surveyed"
             remarks = (f"{words}: {prepared.stranger}; it was surveyed alone", *remarks)
@@ -268,7 +267,7 @@ class StripTask:
         replaces = options.overwrite or options.resume
         size = writer.complete()
         self._report += RunReport(timing={"publish": Seconds.now() - start})
-        warnings = find_warnings(prepared, self._report, missed, writer.dropped)
+        warnings = report_file.find_warnings(prepared, self._report, missed, writer.dropped)
         self._report = replace(self._report, warnings=warnings)
         document = report_file.build_document(prepared, self._described, self._report, cloud, size)
         draft = draft_text(report, report_file.format_report(document), overwrite=replaces)

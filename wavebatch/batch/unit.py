@@ -29,7 +29,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.point_filter import TESTS, PlannedFilter
 from wavebatch.files.cloud.writer import OutputLayout
 from wavebatch.files.disk.raw_bytes import naming, undoing
-from wavebatch.files.disk.temp_store import RowParcel
+from wavebatch.files.disk.temp_store import Spool, spool_rows
 from wavebatch.files.las.header import split_numbers
 from wavebatch.files.las.write_points import CHUNK_POINTS, Chunk, Statistics, compress_rows
 from wavebatch.files.pulse_energy import PulseEnergy
@@ -107,7 +107,7 @@ class Prepared:
 class UnitResult(NamedTuple):
     """What a unit becomes."""
 
-    rows: RowParcel
+    rows: Spool
     """Those that are written and not yet compressed, in the cloud's layout."""
     statistics: Statistics
     """Of all rows that are written."""
@@ -297,7 +297,7 @@ def finish_rows(
         start = Seconds.now()
         chunks, rows = pack_rows(prepared.job.path, rows, prepared.layout.point_format), rows[:0]
         timing["write"] = Seconds.now() - start
-    return UnitResult(RowParcel(rows), statistics, replace(report + left, timing=timing), chunks)
+    return UnitResult(spool_rows(rows), statistics, replace(report + left, timing=timing), chunks)
 
 
 def solve_unit(
@@ -394,7 +394,7 @@ def _block_size(unit: Unit, wanted: int | None) -> int:
     return most if wanted is None else min(most, max(wanted * USUAL_SAMPLES // longest, 1), wanted)
 
 
-RowSpan = tuple[RowParcel, int, int]
+RowSpan = tuple[Spool, int, int]
 """Rows [start, stop) of a unit."""
 
 
@@ -405,13 +405,13 @@ class Packing:
         self._parts: deque[RowSpan] = deque()
         self._count = 0
         """Rows that are in no chunk yet."""
-        self._open: deque[list[RowParcel]] = deque()
+        self._open: deque[list[Spool]] = deque()
         """Of every chunk under way, the units that end in it."""
 
-    def add(self, rows: RowParcel) -> None:
+    def add(self, rows: Spool) -> None:
         """Take the rows of the next unit."""
-        self._parts.append((rows, 0, len(rows)))
-        self._count += len(rows)
+        self._parts.append((rows, 0, rows.count))
+        self._count += rows.count
 
     def has_chunk(self, last: bool) -> bool:
         """Whether there are rows for a chunk; last: no further units come."""
@@ -471,7 +471,7 @@ def pack_chunk(path: Path, parts: list[RowSpan], point_format: int) -> tuple[Chu
         Where they cannot be compressed.
     """
     start = Seconds.now()
-    rows = np.concatenate([rows.read(first, stop) for rows, first, stop in parts])
+    rows = np.concatenate([rows.read(0)[first:stop] for rows, first, stop in parts])
     (chunk,) = pack_rows(path, rows, point_format)
     return chunk, Seconds.now() - start
 

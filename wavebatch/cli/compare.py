@@ -261,8 +261,6 @@ def list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         elif name == "differences_by":
             for kind, groups in value.items():
                 yield from _list_nested(f"differences by {kind}", groups)
-        elif name == "between":
-            yield from list_rows(value)
         elif name == "vendor":
             for side, one in value.items():
                 # Each side is compared with the vendor's returns: the tables are those of a comparison again.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -224,22 +225,22 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
       # cross sections in voxels of 1 m
       wavebatch voxelize strip.las --size 1 -o voxels.npz
     """  # fmt: skip
+    from wavebatch.batch.job import StripJob
     from wavebatch.batch.options import RunOptions
     from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.surveying.calibrating.calibration_files import load_calibration
-    from wavebatch.surveying.systems.survey_result import load_survey
-    from wavebatch.tools.api import read_sensor
+    from wavebatch.tools.api import find_request, read_sensor
 
     for name in ("trajectory", "lever_arm", "crs", "flight_height"):
         if options[name] is not None and options["calibration"] is None:
             raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")
-    settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options),
-                                   selection=PointFilter(where=options["where"]))  # fmt: skip
-    names = ("direction", "headerless", "overwrite", "force", "profiles")
+    settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options))
     asked = shared.from_options(RunOptions, options)
-    more: dict[str, Any] = {"sensor": read_sensor(asked), **{name: options[name] for name in names}}
-    more["system"] = None if asked.system is None else load_survey(asked.system)
-    more["calibration"] = None if asked.calibration is None else load_calibration(asked.calibration)
+    chain, request = find_request(asked)
+    calibration = None if asked.calibration is None else load_calibration(Path(asked.calibration))
+    job = StripJob(Path(), chain, asked, request=request, sensor=read_sensor(asked), calibration=calibration,
+                   selection=PointFilter(where=options["where"]))  # fmt: skip
+    files = {name: options[name] for name in ("overwrite", "profiles")}
     paths = shared.find_inputs(strips, recursive=options["recursive"])
     if options["profiles"] is not None:
         refuse_input(options["profiles"])
@@ -256,7 +257,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
                 bar.total = total
                 bar.update(done)
 
-            summary = voxelize_strip(strip, targets[strip], settings, progress=show, **more)
+            summary = voxelize_strip(replace(job, path=strip), targets[strip], settings, progress=show, **files)
         # With --quiet too: they say how far the values can be trusted
         talk(*(f"{strip}: warning: {line}" for line in summary.warnings))
         for line in _list_lines(summary):

@@ -21,7 +21,6 @@ import tomllib
 import types
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from datetime import date
 from typing import Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from wavebatch.core.errors import ConfigError, nearest
@@ -483,6 +482,6 @@ def _read_entry(one: Entry, table: TomlTable, key: str) -> Any:
         return {name: inner.number(name, low, high) for name in inner.values}
     if kind is int:
         return table.integer(key, int(low), int(high))
-    if kind is str and isinstance(table.values[key], date | int | float):
+    if kind is str and isinstance(table.values[key], datetime.date | int | float):
         return str(table.values[key])  # a day or a number that a person wrote without quotes
     return table.number(key, low, high) if kind is float else table.get(key, kind)

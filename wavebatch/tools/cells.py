@@ -23,7 +23,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
 from wavebatch.files.cloud.column_names import read_provenance
-from wavebatch.files.cloud.point_filter import EVERY, PointFilter, check_bbox
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter, check_bbox, read_bbox
 from wavebatch.files.disk.raw_bytes import undoing
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
@@ -238,10 +238,6 @@ Box = tuple[float, float, float, float]
 LARGEST_SIZE = 1e9
 """Largest side of a cell: more than the world; larger ones overflow."""
 
-STATISTICS = ("mean", "median", "min", "max", "std", "count", "density")
-"""std: standard deviation with n - 1, no-data for one value; density: points with a value per area."""
-
-
 @frozen
 class Grid:
     """Square cells of one size; their borders are multiples of it, so that rasters of neighbouring clouds fit."""
@@ -275,14 +271,10 @@ class Grid:
         return np.where(inside, row, -1).astype(np.int64), np.where(inside, column, -1).astype(np.int64), inside
 
 
-def check_cells(statistic: str, bounds: Box | None, paths: Sequence[Path]) -> None:
-    """Raises ConfigError for an unknown statistic, and for bounds of clouds that hold no place, or in another order."""
-    if statistic not in STATISTICS:
-        raise ConfigError(f"statistic {statistic!r} is not one of {', '.join(STATISTICS)}")
+def check_bounds(bounds: Box | None, paths: Sequence[Path]) -> None:
+    """Raises ConfigError for bounds of clouds that hold no place, or in another order."""
     if bounds is not None:
-        west, south, east, north = bounds
-        if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):
-            raise ConfigError("--bbox must be WEST,SOUTH,EAST,NORTH, west of east and south of north")
+        read_bbox(bounds)
         for path in paths:
             check_bbox(bounds, path, read_header(path))
 
@@ -290,7 +282,8 @@ def check_cells(statistic: str, bounds: Box | None, paths: Sequence[Path]) -> No
 def compute_cells(statistic: str, cell: np.ndarray, values: np.ndarray, number: int, area: float) -> np.ndarray:
     """The statistic of values f8 (n,) by cell i8 (n,), f8 (number,); NaN in cells without a value.
 
-    area: of a cell, for the density.
+    statistic: mean, median, min, max, count; std: standard deviation with n - 1, NaN for one value; density: values per
+    area. area: of a cell.
     """
     known = np.isfinite(values)
     cell, values = cell[known], values[known]
@@ -343,8 +336,8 @@ class Placed:
 
 
 Statistic = str | Callable[[np.ndarray, np.ndarray, int], np.ndarray]
-"""One of STATISTICS; or a function from the cell of each point i8 (n,), the values of all columns f8 (n, k) and the
-number of cells to bands f8 (m, cells)."""
+"""A name, as for `compute_cells`; or a function from the cell of each point i8 (n,), the values of all columns f8
+(n, k) and the number of cells to bands f8 (m, cells)."""
 
 
 def compute_tiles(
@@ -497,8 +490,7 @@ def grid_values(
     """
     if size is not None and not (LEAST_SIZE <= size <= LARGEST_SIZE):
         raise ConfigError(f"cells must be at least {LEAST_SIZE:g} and at most {LARGEST_SIZE:g} m long, got {size:g}")
-    check_cells(statistic, bounds, paths)
-    check_statistic(column, statistic)
+    check_bounds(bounds, paths)
     clouds = Clouds(paths, (column,), selection)
     check_statistic(column, statistic, clouds.facts, paths[0])
     crs = check_crs(paths)

@@ -348,7 +348,7 @@ def write_grid(
                               "--bbox takes whole cells")  # fmt: skip
         metrics = Forest(paths, options.size, options.forest)
         options = replace(options, columns=tuple(COLUMNS))
-    cells.check_cells(options.statistic, options.bbox, paths)
+    cells.check_bounds(options.bbox, paths)
     cells.check_statistic(next(iter(options.columns), None), options.statistic)
     check_options(options)
     if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields
 from typing import Annotated, Literal
 
 import numpy as np
@@ -37,34 +36,13 @@ _FLOOR = 0.25
 """Quantile of a waveform that is used as its level without signal: signal fills less than three quarters."""
 
 
-@frozen(eq=False)
-class _Pulses:
-    """n pulses, or first their waveforms, in file order, with count[i] samples of pulse i in `time` and `values`, one
-    pulse after the other."""
-
-    point: np.ndarray
-    gps_time: np.ndarray
-    origin: np.ndarray
-    direction: np.ndarray
-    spacing: np.ndarray
-    count: np.ndarray
-    time: np.ndarray
-    """After sample 0 [ns], of each sample."""
-    values: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.point)
-
-    @property
-    def first(self) -> np.ndarray:
-        """Where the samples of each pulse begin."""
-        return np.cumsum(self.count) - self.count
-
-    def take(self, rows: np.ndarray) -> _Pulses:
-        """Some pulses, with only their samples."""
-        kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:-2]}
-        samples = expand(self.first[rows], kept["count"])
-        return _Pulses(**kept, time=self.time[samples], values=self.values[samples])
+_PULSE = np.dtype([
+    ("point", "<i8"), ("gps_time", "<f8"), ("origin", "<f8", (3,)), ("direction", "<f8", (3,)),
+    ("spacing", "<f8"), ("count", "<i8"),
+])  # fmt: skip
+"""A pulse, or first one of its waveforms; `count` samples of it lie one after the other."""
+_SAMPLE = np.dtype([("time", "<f8"), ("value", "<f4")])
+"""A sample: its time after sample 0 [ns], and what it is above the level without signal [count]."""
 
 
 @frozen(eq=False)
@@ -108,33 +86,33 @@ def read_scan_lines(
             raise InputError(f"{reader.facts.path}: {what}")
     number = lost = total = 0
     axis = None
-    rest: list[_Pulses] = []
+    rest = (np.empty(0, _PULSE), np.empty(0, _SAMPLE))
     for unit in reader.read_units(scan):
-        parts = rest + [_shape(block) for block, _ in reader.read_blocks(unit, _BLOCK, True)]
-        if not parts:
+        parts = [rest, *(_shape(block) for block, _ in reader.read_blocks(unit, _BLOCK, True))]
+        pulses, samples = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        if not len(pulses):
             continue
-        names = [field.name for field in fields(_Pulses)]
-        pulses = _Pulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
         # Waveforms of one time and direction are one pulse, the earliest first.
-        waveforms = pulses.take(np.argsort(pulses.point, kind="stable"))
-        ray, n = waveforms.direction, len(waveforms)
-        new = find_pulses(waveforms.gps_time) == np.arange(n)
+        pulses, samples = _take(pulses, samples, np.argsort(pulses["point"], kind="stable"))
+        ray, origin, n = pulses["direction"], pulses["origin"], len(pulses)
+        new = find_pulses(pulses["gps_time"]) == np.arange(n)
         turned = np.linalg.norm(np.diff(ray, axis=0), axis=1) > _SAME_RAY * np.linalg.norm(ray[1:], axis=1)
         new[1:] |= turned
         start, pulse = np.flatnonzero(new), np.cumsum(new) - 1
         lead = start[pulse]
-        lag = ((waveforms.origin - waveforms.origin[lead]) * ray[lead]).sum(axis=1) / (ray[lead] ** 2).sum(axis=1)
+        lag = ((origin - origin[lead]) * ray[lead]).sum(axis=1) / (ray[lead] ** 2).sum(axis=1)
         order = np.lexsort((lag, pulse))
-        waveforms, lag = waveforms.take(order), lag[order]
-        first = {field.name: getattr(waveforms, field.name)[start] for field in fields(waveforms)[:-3]}
-        time = waveforms.time + np.repeat(lag - lag[start][pulse], waveforms.count)
-        pulses = _Pulses(**first, count=np.add.reduceat(waveforms.count, start), time=time, values=waveforms.values)
-        flat, length = pulses.direction[:, :2], np.linalg.norm(pulses.direction, axis=1)
+        (pulses, samples), lag = _take(pulses, samples, order), lag[order]
+        samples["time"] += np.repeat(lag - lag[start][pulse], pulses["count"])
+        count = np.add.reduceat(pulses["count"], start)
+        pulses = pulses[start]
+        pulses["count"] = count
+        flat, length = pulses["direction"][:, :2], np.linalg.norm(pulses["direction"], axis=1)
         if axis is None:  # across the flight: where rays spread most
             unit_rays = flat / length[:, None]
             axis = find_main_axis(unit_rays - unit_rays.mean(axis=0))
         angle = np.arcsin(np.clip(flat @ axis / length, -1, 1))
-        edges = np.append(find_sweeps(angle, pulses.gps_time), len(pulses))
+        edges = np.append(find_sweeps(angle, pulses["gps_time"]), len(pulses))
         # Lines that are too long are cut.
         pieces = [np.arange(a, b, most) for a, b in zip(edges[:-1], edges[1:], strict=True)]
         edges = np.concatenate([*pieces, edges[-1:]])
@@ -146,9 +124,9 @@ def read_scan_lines(
             if b - a < least:
                 lost += b - a
                 continue
-            yield _build_line(number, pulses.take(np.arange(a, b)))
+            yield _build_line(number, *_take(pulses, samples, np.arange(a, b)))
             number += 1
-        rest = [pulses.take(np.arange(edges[-2], len(pulses)))]
+        rest = _take(pulses, samples, np.arange(edges[-2], len(pulses)))
     if 0 < total < least:
         need = f"a scan line to find surfaces in needs {least}"
         raise InputError(f"{reader.facts.path}: has {total} pulse{'s' * (total > 1)}, {need}")
@@ -159,7 +137,8 @@ def read_scan_lines(
         )
 
 
-def _shape(block: WaveformBlock) -> _Pulses:
+def _shape(block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
+    """The waveforms of a block and their samples."""
     n, s = block.samples.shape
     # Fill holds the lower quartile of what was recorded (docs/algorithms.md H8), so it does not move the level.
     values = block.samples.astype(np.float32)
@@ -167,9 +146,17 @@ def _shape(block: WaveformBlock) -> _Pulses:
     values -= np.partition(values, at, axis=1)[:, at : at + 1]
     if block.missing is not None:
         values[block.missing] = np.nan
-    place = (block.point, block.gps_time, block.origin, block.direction)
-    time = np.tile(np.arange(s) * block.spacing, n)
-    return _Pulses(*place, np.full(n, block.spacing), np.full(n, s), time, values.reshape(-1))
+    pulses, samples = np.empty(n, _PULSE), np.empty((n, s), _SAMPLE)
+    for name in ("point", "gps_time", "origin", "direction", "spacing"):
+        pulses[name] = getattr(block, name)
+    pulses["count"], samples["time"], samples["value"] = s, np.arange(s) * block.spacing, values
+    return pulses, samples.reshape(-1)
+
+
+def _take(pulses: np.ndarray, samples: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Some pulses with only their samples."""
+    first = np.cumsum(pulses["count"]) - pulses["count"]
+    return pulses[rows], samples[expand(first[rows], pulses["count"][rows])]
 
 
 def find_main_axis(apart: np.ndarray) -> np.ndarray:
@@ -178,10 +165,11 @@ def find_main_axis(apart: np.ndarray) -> np.ndarray:
     return axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
 
 
-def _build_line(number: int, pulses: _Pulses) -> ScanLine:
-    row = np.repeat(np.arange(len(pulses)), pulses.count)
-    place, there = (pulses.point, pulses.gps_time, pulses.origin, pulses.direction), ~np.isnan(pulses.values)
-    return ScanLine(number, *place, float(pulses.spacing[0]), row[there], pulses.time[there], pulses.values[there])
+def _build_line(number: int, pulses: np.ndarray, samples: np.ndarray) -> ScanLine:
+    place = {name: np.ascontiguousarray(pulses[name]) for name in ("point", "gps_time", "origin", "direction")}
+    there = ~np.isnan(samples["value"])
+    known = {"row": np.repeat(np.arange(len(pulses)), pulses["count"])[there], "time": samples["time"][there]}
+    return ScanLine(number, spacing=float(pulses["spacing"][0]), value=samples["value"][there], **place, **known)
 
 
 def align_times(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:

@@ -18,7 +18,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column
-from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las import header as las
@@ -229,18 +228,11 @@ def style_columns(
     taken: names of the input's extra bytes, which stay. If the name of a wavebatch column is equal to one of these, to
     a LAS field or to another column (compared by `normalise`), it gets the prefix `wb_`, or `wb2_`, `wb3_` ... if that
     is taken too. Columns that are LAS fields (x, y, z) are skipped, repeated ones count once.
-    no_data: a key of NO_DATA.
-    Raises ConfigError for an unknown style, column or no-data value.
+    style, no_data: keys of STYLES and NO_DATA.
     """
-    if style not in STYLES:
-        raise ConfigError(f"names {style!r}: must be one of {', '.join(STYLES)}")
-    if no_data not in NO_DATA:
-        raise ConfigError(f"no_data {no_data!r}: must be one of {', '.join(NO_DATA)}")
     used = {normalise(name) for name in taken} | _STANDARD
     written: list[WrittenColumn] = []
     for key in dict.fromkeys(columns):
-        if key not in COLUMNS:
-            raise ConfigError(f"column {key!r} does not exist; {nearest(key, COLUMNS)}")
         column = COLUMNS[key]
         if not column.extra_bytes:
             continue

@@ -81,10 +81,6 @@ class PointFilter:
         chosen = () if classes is None else tuple(sorted({int(number) for number in classes}))
         if classes is not None and not (chosen and 0 <= chosen[0] <= chosen[-1] <= 255):
             raise ConfigError(f"--classes: {list(classes)} must be numbers from 0 to 255, e.g. 2,6")
-        box = None if bbox is None else tuple(map(float, bbox))
-        if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
-            order = "must be west, south, east, north, with west < east and south < north"
-            raise ConfigError(f"--bbox: {','.join(f'{edge:.15g}' for edge in box)} {order}")
         polygons: tuple[Polygon, ...] = ()
         file = None
         if polygon is not None:
@@ -98,7 +94,7 @@ class PointFilter:
         return cls(
             drop_flags=flags,
             classes=chosen,
-            bbox=box,
+            bbox=None if bbox is None else read_bbox(bbox),
             polygons=polygons,
             polygon_file=file,
             where=parse_condition(where) if isinstance(where, str) else where,
@@ -167,6 +163,15 @@ class PointFilter:
 
 EVERY = PointFilter()
 """All points."""
+
+
+def read_bbox(bbox: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return a box as four numbers; raises ConfigError for any that is empty, or in another order."""
+    box = tuple(map(float, bbox))
+    if not (len(box) == 4 and 0 < box[2] - box[0] < math.inf and 0 < box[3] - box[1] < math.inf):
+        order = "must be west, south, east, north, with west < east and south < north"
+        raise ConfigError(f"--bbox: {','.join(f'{edge:.15g}' for edge in box)} {order}")
+    return box
 
 
 def check_bbox(bbox: Sequence[float], path: Path, header: LasHeader) -> None:

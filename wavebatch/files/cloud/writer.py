@@ -38,9 +38,6 @@ from wavebatch.files.las.read_points import CheckedHeader
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
 from wavebatch.files.strip.packets import PacketPlace, StripFacts
 
-LAS_VERSIONS = ("1.4", "1.3", "keep")
-"""Values of --las-version."""
-
 
 @frozen(eq=False)
 class Version:
@@ -57,12 +54,10 @@ class Version:
 def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format: int | None, keep: bool) -> Version:
     """Return version and point format of the cloud of a strip.
 
-    wanted: one of LAS_VERSIONS. point_format: that which the user wants, or None. keep: packets are kept, and with them
+    wanted: as --las-version. point_format: that which the user wants, or None. keep: packets are kept, and with them
     the format's waveform fields. Raises ConfigError for options that contradict each other, InputError for a strip that
     cannot be written in this way.
     """
-    if wanted not in LAS_VERSIONS:
-        raise ConfigError(f"las_version {wanted!r}: must be one of {', '.join(LAS_VERSIONS)}")
     target = las.choose_format(path, header, point_format, keep)
     evlrs, _ = las.find_evlrs(path, header)
     pairs = zip(header.vlrs, repair_records(header.vlrs), strict=True)
@@ -301,8 +296,6 @@ def plan_output(
     ConfigError
         For wrong options.
     """
-    if points not in ("echoes", "returns"):
-        raise ConfigError(f"points {points!r}: must be echoes or returns")
     path = checked.path
     chosen = choose_version(path, checked.header, las_version, point_format, packets is not None)
     whole = points == "returns"

@@ -90,6 +90,8 @@ def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
 
 MOST_HEADER = 4096
 """Most bytes of the description of an array; NumPy writes 118."""
+_MOST_TEXT = 4 << 20
+"""Most bytes of a text: descriptions and CRSs take a few thousand."""
 
 _DAMAGED = (
     zipfile.BadZipFile, zlib.error, struct.error, ValueError, TypeError, EOFError, KeyError, RuntimeError,
@@ -190,7 +192,7 @@ def read_npz(path: Path, names: Mapping[str, tuple[str, int]], what: str, remedy
 def _read_array(member: IO[bytes], size: int, name: str, kinds: str, axes: int) -> np.ndarray:
     """size: bytes of the member; a damaged description may claim more, for which memory would be taken."""
     shape, in_fortran, dtype = read_array_header(member)
-    if dtype.kind not in kinds or len(shape) != axes:
+    if dtype.kind not in kinds or len(shape) != axes or (dtype.kind == "U" and dtype.itemsize > _MOST_TEXT):
         raise ValueError(f"{name} is {dtype} with {len(shape)} axes")
     needed = math.prod(shape) * dtype.itemsize
     if needed > size:
@@ -199,12 +201,7 @@ def _read_array(member: IO[bytes], size: int, name: str, kinds: str, axes: int) 
     if len(data) != needed:
         raise ValueError(f"{name} ends too early")
     if dtype.kind == "U":
-        return np.array(read_array_text(data, dtype), object)
+        order = "be" if dtype.byteorder == ">" else "le"
+        return np.array(data.decode(f"utf-32-{order}").rstrip("\0"), object)
     member.read(1)  # zipfile compares the checksum at the end only
     return np.frombuffer(data, dtype).reshape(shape, order="F" if in_fortran else "C")
-
-
-def read_array_text(data: bytes, dtype: np.dtype) -> str:
-    """Return the text of an array without axes; raises ValueError where its bytes are none."""
-    order = "be" if dtype.byteorder == ">" else "le"
-    return data.decode(f"utf-32-{order}").rstrip("\0")

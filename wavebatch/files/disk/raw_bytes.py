@@ -119,17 +119,6 @@ def widen_integers(values: np.ndarray) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def reporting_reads(path: Path, what: str = "", remedy: str = "") -> Iterator[None]:
-    """Turn an error of the operating system while `path` is read into one InputError line."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, InputError) and str(error).startswith(str(path)):
-            raise
-        raise InputError(f"{path}: {what}cannot be read: {error.strerror or error}{remedy}") from error
-
-
-@contextlib.contextmanager
 def naming(path: Path, what: str = "") -> Iterator[None]:
     """Let an InputError from inside begin with the name of the file, and what; one that names the file stays."""
     try:
@@ -138,6 +127,14 @@ def naming(path: Path, what: str = "") -> Iterator[None]:
         if str(error).startswith(str(path)):
             raise
         raise InputError(f"{path}: {what}{error}") from error
+
+
+@contextlib.contextmanager
+def reporting_reads(path: Path, what: str = "", remedy: str = "") -> Iterator[None]:
+    """Turn an error of the operating system while `path` is read into one InputError line."""
+    begin = f"{what}cannot be read: "
+    with naming(path, begin), in_one_line(lambda _, why: f"{path}: {begin}{why}{remedy}"):
+        yield
 
 
 @contextlib.contextmanager

@@ -2,9 +2,9 @@
 
 The strip scan, the second pass, the voxel grid and all that compares clouds use it. Folders are removed when their
 process ends, or by the next run if it was killed: a folder is in use as long as it is locked. `Spool` sorts entries
-into numbered buckets (`count_buckets`, `spread_keys`), `RowParcel` takes rows from one process to another past the one
-that writes the cloud, `RowStore` keeps the rows of a cloud for the second pass, `KeyedSums` sums integers by key. All
-points of a pulse must come into the same bucket: sort by keys that are equal for equal GPS times.
+into numbered buckets (`count_buckets`, `spread_keys`); that of `spool_rows` takes rows from one process to another past
+the one that writes the cloud. `RowStore` keeps the rows of a cloud for the second pass, `KeyedSums` sums integers by
+key. All points of a pulse must come into the same bucket: sort by keys that are equal for equal GPS times.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -250,43 +250,18 @@ class Spool(Closing):
             self._segments.append(at)
 
 
-PARCEL_KEPT = 1 << 16
-"""Bytes that travel themselves: a file costs more."""
+ROWS_KEPT = 1 << 16
+"""Bytes of rows that travel themselves: a file costs more."""
 
 
-class RowParcel(Closing):
-    """Rows (m,), in memory or in a file; the last to use them calls `close`."""
+def spool_rows(rows: np.ndarray) -> Spool:
+    """Return a spool of rows (m,), in one bucket, which takes them past the process that writes.
 
-    def __init__(self, rows: np.ndarray) -> None:
-        self.count, self._dtype = len(rows), rows.dtype
-        self._rows: np.ndarray | Path = np.ascontiguousarray(rows)
-        """Or the file that has them."""
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Move the rows to a file; without room for it they travel themselves."""
-        if isinstance(self._rows, np.ndarray) and self._rows.nbytes > PARCEL_KEPT:
-            with contextlib.suppress(OSError):
-                path = make_folder() / "rows"
-                self._rows.tofile(path)
-                self._rows = path
-        return self.__dict__
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """Return rows [start, stop)."""
-        if isinstance(self._rows, np.ndarray):
-            return self._rows[start:stop]
-        rows = np.empty(stop - start, self._dtype)
-        with reporting_scratch(), open(self._rows, "rb", buffering=0) as file:
-            read_exactly(file.fileno(), rows.view(np.uint8), start * rows.itemsize)
-        return rows
-
-    def close(self) -> None:
-        """Remove the file; may be called twice."""
-        if isinstance(self._rows, Path):
-            shutil.rmtree(self._rows.parent, ignore_errors=True)
+    They stay in memory until it is pickled. The last to use them calls `close`.
+    """
+    spool = Spool(1, rows.dtype, memory=1 << 62, kept=ROWS_KEPT)
+    spool.append(np.zeros(len(rows), np.int64), rows)
+    return spool.seal()
 
 
 STORE_PIECE = 1 << 16
@@ -350,110 +325,42 @@ class RowStore:
 
 
 ROWS_IN_MEMORY = 1 << 18
-"""Rows in memory before they are sorted and written to disk."""
-
-STRIDE = 256
-"""One key of so many rows on disk stays in memory, to find ranges of keys without reading."""
+"""Rows in memory before they are written to disk."""
 
 
 class KeyedSums(Closing):
-    """Sums of `columns` integers per key: `add` any number of times, then `pieces`, then `close`.
+    """Sums of `columns` integers per key: `add` any number of times, then `pieces`, then `close`. A context manager.
 
-    in_memory: most rows there; more rows go to a temporary file. stride: rows between two keys that mark places in it.
-    A context manager.
+    borders: ascending keys, u8; all rows from one to the next are in memory at a time. in_memory: most rows there until
+    some go to a temporary file.
     """
 
-    def __init__(self, columns: int, *, in_memory: int = ROWS_IN_MEMORY, stride: int = STRIDE) -> None:
-        self._in_memory, self._stride = in_memory, stride
-        self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
-        self._parts: list[tuple[np.ndarray, np.ndarray]] = []
-        self._number = 0
-        self._file: IO[bytes] | None = None
-        self._runs: list[_Run] = []
+    def __init__(self, columns: int, borders: np.ndarray, *, in_memory: int = ROWS_IN_MEMORY) -> None:
+        dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
+        self._borders, self._rows = borders, Spool(len(borders) + 1, dtype, memory=in_memory * dtype.itemsize)
 
     def close(self) -> None:
         """Remove the temporary file."""
-        self._parts = []
-        if self._file is not None:
-            self._file.close()
+        self._rows.close()
 
     def add(self, key: np.ndarray, value: np.ndarray) -> None:
         """Add rows: key u8 (m,), value i8 (m, columns)."""
-        if not len(key):
-            return
-        self._parts.append(_sum([(key, value)]))
-        self._number += len(self._parts[-1][0])
-        if self._number > self._in_memory:
-            self._shrink()
-            if self._number > self._in_memory // 2:
-                self._spill()
+        if len(key):
+            key, value = _sum(key, value)
+            rows = np.empty(len(key), self._rows.dtype)
+            rows["key"], rows["value"] = key, value
+            self._rows.append(np.searchsorted(self._borders, key, side="right"), rows)
 
     def pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield keys, ascending and each once, with their sums, some at a time."""
-        if not self._runs:
-            self._shrink()
-            yield from self._parts
-            return
-        self._spill()
-        # Ascending ranges of keys with about `in_memory` rows each; none is empty.
-        marks = np.sort(np.concatenate([run.marks for run in self._runs]))
-        borders = np.unique(marks[:: max(self._in_memory // self._stride, 1)]).tolist()
-        for low, high in zip(borders, [*borders[1:], 1 << 64], strict=True):
-            touched = [run for run in self._runs if int(run.marks[0]) < high and run.last >= low]
-            parts = []
-            for run in touched:
-                # Between two keys that mark places, then without the rows whose keys are not in [low, high).
-                begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * self._stride
-                end = run.number
-                if high <= run.last:
-                    end = min(int(np.searchsorted(run.marks, np.uint64(high))) * self._stride, end)
-                if self._file is None:
-                    raise ValueError("the sums are closed")
-                with reporting_scratch():
-                    self._file.seek((run.first + begin) * self._dtype.itemsize)
-                    data = self._file.read((end - begin) * self._dtype.itemsize)
-                if len(data) != (end - begin) * self._dtype.itemsize:
-                    raise InputError(f"{scratch_place()}: a temporary file was cut by another program; run again")
-                rows = np.frombuffer(data, self._dtype)
-                last = len(rows) if high > run.last else int(np.searchsorted(rows["key"], np.uint64(high)))
-                rows = rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
-                parts.append((rows["key"], rows["value"]))
-            yield _sum(parts)
-
-    def _shrink(self) -> None:
-        """Sums up the rows in memory."""
-        if len(self._parts) > 1:
-            self._parts = [_sum(self._parts)]
-        self._number = sum(len(key) for key, _ in self._parts)
-
-    def _spill(self) -> None:
-        self._shrink()
-        with reporting_scratch():
-            if self._file is None:
-                self._file = tempfile.TemporaryFile(dir=scratch_place())  # noqa: SIM115 - closed by close()
-            for key, value in self._parts:
-                rows = np.empty(len(key), self._dtype)
-                rows["key"], rows["value"] = key, value
-                first = self._file.seek(0, 2) // self._dtype.itemsize
-                self._file.write(rows.data)
-                self._runs.append(_Run(first, len(key), key[::self._stride].copy(), int(key[-1])))
-        self._parts, self._number = [], 0
+        """Yield keys, ascending and each once, with their sums, those between two borders at a time."""
+        for bucket in range(self._rows.buckets):
+            rows = self._rows.read(bucket)
+            if len(rows):
+                yield _sum(rows["key"], rows["value"])
 
 
-class _Run(NamedTuple):
-    """Rows in the file that are sorted by key."""
-
-    first: int
-    number: int
-    marks: np.ndarray
-    """Keys of its rows 0, STRIDE, 2 STRIDE ..., u8."""
-    last: int
-    """The largest key."""
-
-
-def _sum(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Keys of all parts, ascending and each once, with the sums of their rows; there must be at least one row."""
-    key, value = parts[0] if len(parts) == 1 else (np.concatenate(one) for one in zip(*parts, strict=True))
+def _sum(key: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keys (m,), m > 0, ascending and each once, with the sums of their rows."""
     order = np.argsort(key, kind="stable")
     key = key[order]
     first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))

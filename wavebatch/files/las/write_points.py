@@ -23,7 +23,6 @@ import numpy as np
 
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.interrupts import uninterrupted
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import naming, undoing
 from wavebatch.files.las import header as las
@@ -62,7 +61,7 @@ def compress_rows(rows: np.ndarray, point_format: int) -> Chunk:
     coding = lazrs.LazVlr(_encode_coding(point_format, rows.itemsize))
     file = BytesIO()
     try:
-        with uninterrupted():  # lazrs takes KeyboardInterrupt for a failed write
+        with interrupts.uninterrupted():  # lazrs takes KeyboardInterrupt for a failed write
             compressor = lazrs.LasZipCompressor(file, coding)
             compressor.compress_many(np.ascontiguousarray(rows).view(np.uint8))
             compressor.done()

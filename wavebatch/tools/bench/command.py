@@ -60,7 +60,6 @@ from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.look import pool_blocks
 from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench import accuracy
-from wavebatch.tools.bench.accuracy import find_front
 from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn
@@ -641,7 +640,7 @@ def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: flo
     if not known:
         return
     chains = np.array([row["kind"] == "chain" for row in known])
-    front = find_front(np.where(chains[:, None], np.stack([time, value], axis=1), np.nan))
+    front = accuracy.find_front(np.where(chains[:, None], np.stack([time, value], axis=1), np.nan))
     order = np.flatnonzero(front)[np.argsort(time[front])]
     axes.plot(time[order], value[order], color="tab:red", zorder=1, label="Pareto front")
     for i, row in enumerate(known):

@@ -26,7 +26,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import CheckedOptions, Range, option
-from wavebatch.files.disk.npz import NpzWriter, read_array_header, read_array_text, reading_npz
+from wavebatch.files.disk.npz import NpzWriter, read_array_header, read_npz, reading_npz
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, build_dtype, field_names
 from wavebatch.files.las.write_points import PointFile
@@ -62,9 +62,7 @@ PACKET_COLUMNS: dict[str, str] = {"packet_byte_offset": "<u8", "packet_gps_time"
 _DTYPES = {**ECHO_COLUMNS, **PACKET_COLUMNS}
 _META = "meta"
 _PIECE = 1 << 18
-_MOST_TEXT = 4 << 20
-"""Most bytes of the description: it takes a few hundred."""
-
+_WHAT, _REMEDY = "truth file of `wavebatch simulate`", "simulate the strip again"
 
 _LARGEST = 1e30
 """Largest value that is taken for a true one; sums and squares of larger ones overflow."""
@@ -75,20 +73,15 @@ class TruthReader(Closing):
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        self._reading = partial(
-            reading_npz, self.path, "truth file of `wavebatch simulate`", "simulate the strip again"
-        )
+        self._reading = partial(reading_npz, self.path, _WHAT, _REMEDY)
         with self._reading():
             self._archive = zipfile.ZipFile(self.path)
             known = set(self._archive.namelist())
             lacking = [name for name in (*_DTYPES, _META) if f"{name}.npy" not in known]
             if lacking:
                 raise InputError(f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(lacking)}")
-            with self._archive.open(f"{_META}.npy") as member:
-                shape, _, dtype = read_array_header(member)
-                if shape or dtype.kind != "U" or dtype.itemsize > _MOST_TEXT:
-                    raise InputError(f"{self.path}: its description is {dtype}, no text; simulate the strip again")
-                self.meta: dict[str, Any] = json.loads(read_array_text(member.read(dtype.itemsize), dtype))
+            text = read_npz(self.path, {_META: ("U", 0)}, _WHAT, _REMEDY)[_META]
+            self.meta: dict[str, Any] = json.loads(text.item())
             # The numbers that comparisons need.
             for key, least, most in (("noise_std", 0.0, 1e9), ("spacing", 1e-6, 1e6), ("packets", 0, 1 << 40)):
                 value = self.meta[key]
@@ -107,11 +100,10 @@ class TruthReader(Closing):
             for name, member in members.items():
                 shape, _, dtype = read_array_header(member)
                 if dtype != np.dtype(_DTYPES[name]) or len(shape) != 1:
-                    words = f"column {name} is {dtype}, not {_DTYPES[name]}; simulate the strip again"
-                    raise InputError(f"{self.path}: {words}")
+                    raise InputError(f"{self.path}: column {name} is {dtype}, not {_DTYPES[name]}; {_REMEDY}")
                 lengths.add(shape[0])
             if len(lengths) != 1:
-                raise InputError(f"{self.path}: columns {', '.join(names)} differ in length; simulate the strip again")
+                raise InputError(f"{self.path}: columns {', '.join(names)} differ in length; {_REMEDY}")
             (length,) = lengths
             for start in range(0, length, size):
                 rows = min(size, length - start)
@@ -121,11 +113,11 @@ class TruthReader(Closing):
         dtype = np.dtype(_DTYPES[name])
         data = member.read(rows * dtype.itemsize)
         if len(data) != rows * dtype.itemsize:
-            raise InputError(f"{self.path}: ends too early; simulate the strip again")
+            raise InputError(f"{self.path}: ends too early; {_REMEDY}")
         values = np.frombuffer(data, dtype)
         if dtype.kind == "f" and (np.abs(values) > _LARGEST).any():
             most = np.nanmax(np.abs(values))
-            raise InputError(f"{self.path}: column {name} holds {most:g}; simulate the strip again")
+            raise InputError(f"{self.path}: column {name} holds {most:g}; {_REMEDY}")
         return values
 
 

@@ -38,6 +38,8 @@ from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.tools.cells import Tally
 from wavebatch.tools.voxels.rays import Floor, LightRule, Rays, measure_lengths
 
+NO_BORDERS = np.empty(0, np.uint64)
+
 LIGHT_UNIT = 2.0**-30
 """Unit in which light is summed [rays]."""
 
@@ -93,7 +95,7 @@ class VoxelGrid(Closing):
     size: of the voxels [m]; faces lie at multiples of it. anchor: index of a voxel in the middle of the strip, counted
     from the origin of the coordinates, i8 (3,). unit: of energies [DN ns]. sections: whether rays have cross sections.
     everything: also keeps voxels that rays crossed without any signal. floor: the ground, for FOREST_COLUMNS; None:
-    without them. in_memory: see KeyedSums.
+    without them. borders, in_memory: see KeyedSums.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class VoxelGrid(Closing):
         sections: bool,
         everything: bool,
         floor: Floor | None = None,
+        borders: np.ndarray = NO_BORDERS,
         in_memory: int = ROWS_IN_MEMORY,
     ) -> None:
         self.size, self.anchor = size, anchor
@@ -112,7 +115,7 @@ class VoxelGrid(Closing):
         self.columns += () if floor is None else FOREST_COLUMNS
         self._unit, self._sections, self._everything, self._floor = unit, sections, everything, floor
         self._width = 8 if floor is None and not sections else 10 if floor is None else 12
-        self._sums = KeyedSums(self._width, in_memory=in_memory)
+        self._sums = KeyedSums(self._width, borders, in_memory=in_memory)
         self._low = np.full(3, np.iinfo(np.int64).max)
         self._high = np.full(3, np.iinfo(np.int64).min)
         self._energy = 0

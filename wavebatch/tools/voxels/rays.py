@@ -241,6 +241,11 @@ class CellMap:
                 break
             self.cell *= 2.0
 
+    @property
+    def places(self) -> np.ndarray:
+        """Positions of the returns that are kept, f8 (n, 3) [m]."""
+        return self._kept + self._middle
+
     def _key_of(self, local: np.ndarray) -> np.ndarray:
         """Keys of the cells, i8 (m,), of positions from the middle (m, 3)."""
         index = np.clip(np.nan_to_num(np.floor(local[:, :2] / self.cell)), -_REACH, _REACH).astype(np.int64)

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from wavebatch import __version__
+from wavebatch.batch.job import StripJob
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
@@ -24,23 +25,19 @@ from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, count
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
-from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
 from wavebatch.files.disk.temp_store import ROWS_IN_MEMORY
 from wavebatch.files.las.header import locate, split_numbers
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.kernels.geometry.voxels import fits_keys
+from wavebatch.kernels.geometry.voxels import fits_keys, pack_index
 from wavebatch.kernels.physics.gap_probability import HIGHEST_RATIO, LOWEST_RATIO
 from wavebatch.kernels.physics.radiometry import backscatter_error
-from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.inspect_strip import name_gains
 from wavebatch.surveying.prepare import Positions, prepare
-from wavebatch.surveying.sensor import SensorRequest, SensorSource
+from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.systems.figures import describe_system
-from wavebatch.surveying.systems.survey_result import SavedSurvey
 from wavebatch.tools.voxels import grid as voxel_grid
 from wavebatch.tools.voxels import rays
 
@@ -69,6 +66,9 @@ MOST_MISSING = 0.05
 tile cuts fewer, thinning and sorting more."""
 
 
+USUAL_HEIGHT = 30.0
+"""Of what rays cross above the ground [m], by which as many voxels are summed at a time as memory shall hold."""
+
 USUAL = 1000.0
 """Distance [m] for the error of the air where that of the strip is not known."""
 
@@ -94,10 +94,6 @@ class VoxelOptions(CheckedOptions):
     reflectance_ratio: Annotated[float | None, Range(LOWEST_RATIO, HIGHEST_RATIO)] = option(
         None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
     )
-    selection: PointFilter = PointFilter()
-    """Use only pulses of which a return is chosen, with all of their signal."""
-    energy: str | None = None
-    """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
 
 
 @dataclass(slots=True)
@@ -168,51 +164,43 @@ class VoxelSummary:
 
 
 def voxelize_strip(
-    strip: Path,
+    job: StripJob,
     target: Path,
     options: VoxelOptions,
     *,
-    system: SavedSurvey | None = None,
-    force: bool = False,
-    calibration: Calibration | None = None,
-    sensor: SensorRequest | None = None,
-    direction: str = "auto",
-    headerless: bool = False,
     overwrite: bool = False,
     profiles: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
     block_size: int | None = None,
     in_memory: int = ROWS_IN_MEMORY,
-    unit_points: int | None = None,
 ) -> VoxelSummary:
     """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
 
-    system: a saved survey, instead of a survey of this strip. force: also where the strip contradicts it. calibration:
-    for cross sections; it or the survey must have the divergence of the beam. profiles: an .npz for those of single
-    pulses. progress: called with the number of waveforms done since the last call, and the total. block_size,
-    in_memory, unit_points: packets at a time, sums in memory and points of a unit; the output does not depend on them.
+    job: the strip, how it is read, its pulse, sensor and energies; a calibration for cross sections, where it or the
+    survey must have the divergence of the beam; only pulses of which it chooses a return are used, with all of their
+    signal. profiles: an .npz for those of single pulses. progress: called with the number of waveforms done since the
+    last call, and the total. block_size: packets at a time, in_memory: sums there; the output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
-    strip, target = Path(strip), Path(target)
+    strip, target, calibration = job.path, Path(target), job.calibration
     *others, last = voxel_grid.SUFFIXES
     if target.suffix.lower() not in (*others, last):
         raise ConfigError(f"{target}: voxels are written as {', '.join(others)} or {last}")
     with protecting([strip]):
         Draft(target, overwrite=True).discard()  # before the work: whether it can be written
     keep = None  # the filter for the points of the strip, where it leaves any out
-    if options.selection:
+    if job.selection:
         with CloudReader(strip) as cloud:
-            keep = cloud.plan(options.selection)
+            keep = cloud.plan(job.selection)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
-    reader = StripReader(strip, direction=direction, headerless=headerless, unit_points=unit_points)
-    with reader, reader.scan(force=force) as scan:
+    with job.open() as reader, reader.scan(force=job.request.force) as scan:
         if not scan.packets:
             raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
-        setup = prepare(reader, scan, widest_chain(), Request(auto=True, system=system, force=force), sensor=sensor,
-                        positions=positions, calibration=calibration, energy=options.energy)  # fmt: skip
+        setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, positions=positions,
+                        calibration=calibration, energy=job.energy)  # fmt: skip
         source, pulse, energy = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.sent.energy
         doubts, section_error = (*setup.doubts, *(setup.sent.notes if calibration else ())), None
         if calibration is not None:
@@ -271,11 +259,15 @@ def voxelize_strip(
         rule = rays.find_rule(sample, options.reflectance_ratio)
         rule = rays.hold_lost(rule, sample, louder, options.reflectance_ratio)
         most_bits = max(digitizer.bits for digitizer in reader.facts.digitizers.values() if digitizer.n_samples)
+        anchor = np.floor(middle / options.size).astype(np.int64)
+        # Parts of the voxels, in their order, begin at some of the lowest returns, each of which stands for its cell.
+        lowest = np.sort(pack_index(np.floor(floor.places / options.size).astype(np.int64) - anchor))
+        cells = int(in_memory * options.size**3 / (USUAL_HEIGHT * floor.cell**2))
         with (
             voxel_grid.VoxelGrid(
-                options.size, np.floor(middle / options.size).astype(np.int64), voxel_grid.energy_unit(most_bits),
+                options.size, anchor, voxel_grid.energy_unit(most_bits),
                 sections=calibration is not None, everything=options.all_crossed or options.forest,
-                floor=tracer.floor if options.forest else None, in_memory=in_memory,
+                floor=tracer.floor if options.forest else None, borders=lowest[:: max(cells, 1)], in_memory=in_memory,
             ) as grid,
             (
                 voxel_grid.ProfileWriter(Path(profiles), strip, sections=calibration is not None, overwrite=overwrite)
@@ -300,7 +292,7 @@ def voxelize_strip(
                 progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
             grid.measure_spread()
             summary.left_out = 0 if keep is None else scan.packets - summary.waveforms
-            meta = _describe(strip, options, grid, pulse, calibration) | {
+            meta = _describe(job, options, grid, pulse) | {
                 "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source},
                 "hidden_light": rule.hidden_light,
                 "cross_section_error": section_error,
@@ -422,22 +414,22 @@ class _Tracer:
 
 
 def _describe(
-    strip: Path, options: VoxelOptions, grid: voxel_grid.VoxelGrid, pulse: SystemPulse, calibration: Calibration | None
+    job: StripJob, options: VoxelOptions, grid: voxel_grid.VoxelGrid, pulse: SystemPulse
 ) -> dict[str, Any]:
     """How the voxels were made; goes into the file, so it holds no time of day."""
     deconvolution = options.deconvolution
     return {
         "wavebatch": __version__,
-        "command": f"wavebatch voxelize {strip.name} --size {options.size:g}{' --forest' * options.forest}",
-        "strip": strip.name,
+        "command": f"wavebatch voxelize {job.path.name} --size {options.size:g}{' --forest' * options.forest}",
+        "strip": job.path.name,
         "size_m": options.size,
         "headroom_m": options.headroom,
         "all_crossed": options.all_crossed or options.forest,
         "forest": options.forest,
         "ground_height_m": options.ground_height,
-        "where": None if options.selection.where is None else options.selection.where.text,
+        "where": None if job.selection.where is None else job.selection.where.text,
         "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
         "system": describe_system(pulse),
-        "calibration": None if calibration is None else calibration.describe(),
+        "calibration": None if job.calibration is None else job.calibration.describe(),
         "columns": {column.name: {"unit": column.unit, "meaning": column.meaning} for column in grid.columns},
     }
