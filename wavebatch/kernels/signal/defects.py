@@ -122,7 +122,9 @@ def find_transient(above: np.ndarray, std: float) -> int:
         return 0
     first_low, first_high = quantiles(above[:LOOK], [0.05, 0.95])
     inner = np.clip(above[:LOOK], first_low[:, None], first_high[:, None]).mean(axis=1)
-    jumps = (first_high - first_low > WILD * spread) | (np.abs(inner - centre) > max(OFF * std, 0.3))
+    # Light only adds: in a canopy all later samples may have some, where no echo is so early.
+    off = np.abs(inner - np.clip(inner, min(centre, 0.0), centre))
+    jumps = (first_high - first_low > WILD * spread) | (off > max(OFF * std, 0.3))
     return 0 if jumps.all() else int(np.argmin(jumps))
 
 

@@ -262,7 +262,8 @@ def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float
         return 1.0
     if np.count_nonzero(inner & (signal[1:-1] == signal.min())) > MOST_LEAST * len(values):
         return 1.0
-    values = values - median(values)
+    # Counts are whole: where noise stays on two of them their median is one, and either side would be an echo's.
+    values = values - median(values + (np.arange(len(values)) * DITHER[0] % 1).astype(np.float32)) + np.float32(0.5)
     above, below = (float(np.sum(np.square(values[side]), dtype=np.float64)) for side in (values > 0, values < 0))
     return above / max(below, 1e-12)
 
