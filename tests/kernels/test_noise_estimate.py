@@ -169,6 +169,18 @@ def test_noise_that_is_a_little_lopsided_keeps_its_limit():
     assert pooled.std == pytest.approx(np.hypot(2.0, QUANTISATION_STD), rel=0.01)
 
 
+@pytest.mark.parametrize("level", [30.0, 30.25, 30.43, 30.5])
+def test_noise_on_two_counts_is_not_lopsided(rng, level):
+    """Their median is one of them: noise of a level of .43 was 10 % too small, and its correlation by a third."""
+    exact = rng.standard_normal((240, 3000))
+    for at in range(2, 240):
+        exact[at] += 0.78 * exact[at - 1] - 0.27 * exact[at - 2]
+    pooled = estimate_noise(np.rint(level + 0.47 * exact[40:] / exact[40:].std()).astype(np.float32), 6)
+    std = np.hypot(0.47, QUANTISATION_STD)
+    assert pooled.std == pytest.approx(std, rel=0.03)
+    assert pooled.correlation[0] == pytest.approx(0.78 / 1.27 * 0.47**2 / std**2, rel=0.05)
+
+
 @pytest.mark.parametrize(("level", "std"), [(0, 5.0), (4, 5.0), (12, 8.0), (0, 0.6), (3, 40.0), (1, 1.0)])
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_noise_that_is_cut_at_zero_is_that_before_the_cut(level, std, rho):

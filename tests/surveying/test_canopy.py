@@ -120,6 +120,24 @@ def test_a_ringing_that_moves_between_steps_is_a_tail():
     assert all(8 * width < lag < 17 * width and share < 0.006 for lag, share in tail.items())
 
 
+@pytest.mark.parametrize("moves", [True, False])
+def test_what_varies_about_nothing_is_a_tail(moves):
+    """An after-pulse that comes earlier or later from shot to shot leaves as much below nothing as above; neighbours of
+    half of the echoes, there too, do not."""
+    rng = np.random.default_rng(7)
+    n, width, x = 1500, 2.0, np.arange(80.0)
+    height, time = np.exp(rng.uniform(np.log(60), np.log(200), n)), rng.uniform(24, 44, n)
+    z = (x - time[:, None]) / width
+    share = 0.02 * rng.standard_normal(n)[:, None] * (z - 7) if moves else np.maximum(rng.normal(0, 0.02, (n, 1)), 0)
+    signal = height[:, None] * (np.exp(-0.5 * z**2) + share * np.exp(-0.5 * (z - 7) ** 2))
+    block = WaveformBlock.from_samples(np.rint(12 + signal + 0.5 * rng.standard_normal((n, 80))).astype(np.uint8))
+    system = SystemPulse(sigma_ref=width, noise=ReceiverNoise(baseline=12.0, std=0.5))
+    tail = dict(measure_tail(block, system, find_clear(block, system)).tail_misfit)
+    places = {round(lag / width) for lag in tail}
+    assert {6, 8} <= places <= set(range(5, 11)) if moves else not places
+    assert not moves or 0.01 < tail[6 * width] < 0.03
+
+
 @pytest.mark.parametrize("number", [10, 20, 30])
 def test_what_few_echoes_leave_by_chance_is_no_tail(rng, number):
     """Values that scatter by four noises: a tenth to a 25th were a tail, where the lowest two lay close together."""

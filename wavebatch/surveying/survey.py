@@ -17,7 +17,7 @@ from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
-from wavebatch.surveying.measuring.choose_pulse import JOINTLY, STACKED, bear, choose_pulse, learn_alone, settle
+from wavebatch.surveying.measuring.choose_pulse import JOINTLY, STACKED, SUMMED, bear, choose_pulse, learn_alone, settle
 from wavebatch.surveying.measuring.joint_pulse import LEAST_CHANGE
 from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse, measure_skew
@@ -253,7 +253,7 @@ def _survey(
             system = replace(system, faint_share=min(max(share, LEAST_CHANGE), MOST_FAINT))
         starts = {"gaussian": system}
         if len(main) >= ENOUGH_TO_LEARN:
-            starts[STACKED] = learn_pulse(block, system, clear, main, figures)
+            starts |= dict(zip((STACKED, SUMMED), learn_pulse(block, system, clear, main, figures), strict=False))
         else:
             guess = guess_width(block, system)
             starts |= {} if guess is None else {"single echoes": guess}

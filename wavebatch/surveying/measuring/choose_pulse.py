@@ -110,7 +110,7 @@ FINEST = 0.25
 """Part of a doubling to which the least misfit is looked for where descriptions begin to be as short: between misfits
 further apart their standard errors are no line, and no parabola."""
 
-STACKED, JOINTLY = "lone echoes", "lone echoes, jointly"
+STACKED, SUMMED, JOINTLY = "lone echoes", "lone echoes, as a sum", "lone echoes, jointly"
 OF_ALL, OF_ANY, AGAIN = "gaussian of all echoes", "all echoes", ", again"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, OF_ANY: {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
@@ -238,8 +238,10 @@ def choose_pulse(
     for one in {**starts, **given}.items():
         every.setdefault(one[1].pulse, one)
     looked = [_judge(few, name, system, CHANGES[1], known=name in given) for name, system in every.values()]
-    stacked, jointly = (next((one for one in looked if one.name == name), None) for name in (STACKED, JOINTLY))
-    if stacked and jointly and _save(jointly, stacked) <= LEAST_OF_KNOWN:  # the stack shows as much, with less freedom
+    stacked = [one for one in looked if one.name in (STACKED, SUMMED)]
+    jointly = next((one for one in looked if one.name == JOINTLY), None)
+    # The stack may show as much, with less freedom.
+    if jointly and min((_save(jointly, one) for one in stacked), default=np.inf) <= LEAST_OF_KNOWN:
         looked.remove(jointly)
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]

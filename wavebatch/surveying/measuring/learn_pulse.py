@@ -116,8 +116,11 @@ def find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
 
 def learn_pulse(
     block: WaveformBlock, system: SystemPulse, clear: EchoTable, main: EchoTable, figures: Figures
-) -> SystemPulse:
-    """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
+) -> tuple[SystemPulse, ...]:
+    """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2).
+
+    A skewed one also as a sum of Gaussians: the judge decides, where lone echoes do not.
+    """
     noise = pooled_noise(block, system)
     signal = block.samples[main.waveform] - noise.level[main.waveform]
     if block.missing is not None:
@@ -151,13 +154,13 @@ def learn_pulse(
         drawn = stack._replace(value=best.draw(stack.lag), error=np.full(len(stack.lag), 1.0))
         other = fit_gaussians(drawn, width)[-1]
         return _fit_wide_best(block, system, clear, (chosen, _with_pulse(system, other, stack, block.spacing)))
-    return chosen
+    return (chosen,)
 
 
 def _fit_wide_best(
-    block: WaveformBlock, system: SystemPulse, clear: EchoTable, pulses: tuple[SystemPulse, SystemPulse]
-) -> SystemPulse:
-    """The first of two pulses that fit level ground equally well, unless the other fits widened echoes better.
+    block: WaveformBlock, system: SystemPulse, clear: EchoTable, pulses: tuple[SystemPulse, ...]
+) -> tuple[SystemPulse, ...]:
+    """Two pulses that fit level ground equally well; the second alone where it fits widened echoes better.
 
     A target that widens a skewed pulse stretches it as a whole; a sum of Gaussians grows round. Only the strongest
     echoes of slopes and plants show which of them is right.
@@ -165,11 +168,11 @@ def _fit_wide_best(
     top = system.saturation or float(block.samples.max())
     clear = clear.take(np.flatnonzero(clear.amplitude < FAR_FROM_LIMIT * top))
     if not len(clear):
-        return pulses[0]
+        return pulses
     clear = clear.take(np.flatnonzero(clear.sigma > WIDENED * find_edge(clear.sigma)))
     clear = clear.take(np.sort(np.argsort(-clear.amplitude, kind="stable")[:MOST_WIDENED]))
     if not len(clear):
-        return pulses[0]
+        return pulses
     part, rows = block.rows(clear.waveform), np.arange(len(clear))
     misfits: list[float] = []
     for pulse in pulses:
@@ -178,9 +181,9 @@ def _fit_wide_best(
         # In a canopy most of them are several echoes, which no pulse fits: the tenth that fits best is of one.
         residual = adaptive(part, noise, pulse, alone, max_echoes=1).residual
         if not len(residual):
-            return pulses[0]
+            return pulses
         misfits.append(quantile(residual, 0.1))
-    return pulses[1] if misfits[1] < BETTER * misfits[0] else pulses[0]
+    return pulses[1:] if misfits[1] < BETTER * misfits[0] else pulses
 
 
 CORE = 4.0

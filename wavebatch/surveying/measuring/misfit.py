@@ -59,6 +59,10 @@ neighbours, too weak to be found or taken for a part of the pulse. Unless even t
 it. Errors of the mean, which both quantiles tell, and of the lowest one, over the scatter of values and the root of the
 number of echoes: what chance makes is no tail."""
 
+LOW_ERROR, FAR = 1.5, 5
+"""Error of the higher of these quantiles, over the scatter and the root of the number of echoes; and widths of the
+pulse from which what is below nothing is its own: nearer, fits of two echoes as one leave it."""
+
 LARGER = 1.5
 """Standard errors by which what most echoes have more of is a larger share of weaker ones: chance takes one lag of
 fifteen from a tail, whose others stay. Else SURE."""
@@ -362,11 +366,14 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
         scatter = 2 * np.sqrt(seen.spread**2 - left.noise**2)
         share, sure = abs(seen.common) + scatter, abs(seen.common) > SURE * seen.error
         is_part = sure and abs(seen.common) > CONSTANT * scatter
+        # What varies about nothing is no neighbour either: light only adds.
+        many = NORMAL_BELOW[0] * seen.number > 1
+        deep = left.noise * max(CONSTANT, 1 + SURE * LOW_ERROR / np.sqrt(seen.number))
+        is_part |= many and abs(half) >= 2 * FAR and seen.spread - seen.common > deep
         higher, all_have = seen.median > seen.common + seen.spread, False
         if not higher:
             # A tail that changes from shot to shot scatters, but hardly any echo is without it, as without a neighbour.
-            all_have = NORMAL_BELOW[0] * seen.number > 1
-            all_have &= seen.lowest > LOWEST_ERROR * left.noise * SURE / np.sqrt(seen.number)
+            all_have = many and seen.lowest > LOWEST_ERROR * left.noise * SURE / np.sqrt(seen.number)
             # Or it moves, so that some are without it: it is faint then, and as often lower than higher.
             below, above = seen.median - seen.common + seen.spread, seen.high - seen.median
             moves = sure and abs(seen.median) > SURE * seen.error and above < EVEN * below and seen.high < FAINT
