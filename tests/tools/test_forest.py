@@ -159,6 +159,20 @@ def test_footprints_that_show_no_gaps_are_named_and_kept_with_the_voxels(tmp_pat
     assert (found.block, round(found.reach, 2)) == {None: (2, 1.0), 1.0: (3, 0.81), 3.0: (6, 0.89)}[footprint]
 
 
+def test_voxels_that_laspy_writes_again_keep_what_is_not_known(tmp_path):
+    """laspy drops the declarations of no-data: a leaf area of 1.1 was 0 +- 6969, in layers up to 150 m."""
+    simulate_strip("forest", tmp_path / "s.las", pulses=3000)
+    voxelize_strip(tmp_path / "s.las", tmp_path / "v.laz", VoxelOptions(1.0, QUICK, forest=True))
+    voxels = laspy.read(tmp_path / "v.laz")
+    assert (voxels["attenuation"] == -9999).any()
+    voxels.add_extra_dim(laspy.ExtraBytesParams("mine", np.float32))
+    voxels.write(tmp_path / "again.laz")
+    (_, right), (_, found) = (measure(tmp_path / name, tmp_path, box=None) for name in ("v.laz", "again.laz"))
+    assert list(found) == list(right)
+    for name, band in right.items():
+        np.testing.assert_array_equal(found[name], band)
+
+
 def test_leaves_that_show_more_of_themselves_are_fewer(even, tmp_path):
     _, spherical = measure(even[1], tmp_path)
     _, level = measure(even[1], tmp_path, leaf_projection=1.0, layer=10.0)

@@ -19,7 +19,7 @@ import numpy as np
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
-from wavebatch.files.cloud.column_names import STYLES, name_standard, read_field, read_provenance, resolve
+from wavebatch.files.cloud.column_names import NO_DATA, STYLES, name_standard, read_field, read_provenance, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.disk.raw_bytes import Closing, undoing, widen_integers
 from wavebatch.files.las import header as las
@@ -136,11 +136,13 @@ class CloudReader(Closing):
         """The file's name of each wavebatch column, by the provenance of the latest run; empty without one. Columns
         that another program has renamed, left out or stored as several numbers, or flags as signed ones, are none."""
         # Other programs drop the declaration of no-data, laspy where it adds a dimension: -9999 would be an amplitude.
-        for column, field in self._find_ours(COLUMNS, decibel=True).items():
-            record, stored = self.extra[field], [style[column] for style in STYLES.values() if column in style]
-            empty = COLUMNS[column].no_data
-            if record.dtype.kind != "f":
-                empty = next((one.no_data for one in stored if one.scale), None)
+        # In a file that wavebatch made it is no value of any column with a point, as those of voxels.
+        ours = {field: column for column, field in self._find_ours(COLUMNS, decibel=True).items()}
+        for field, record in self.extra.items():
+            stored = [style[ours[field]] for style in STYLES.values() if ours.get(field) in style]
+            empty = next((one.no_data for one in stored if one.scale), None)
+            if record.dtype.kind == "f" and (runs or field in ours):
+                empty = NO_DATA["-9999"]
             if record.no_data is None and empty is not None:
                 self.extra[field] = record.with_no_data([empty])
         self._sources = self._find_ours((*las.field_names(dtype), "echo_flags"))
