@@ -376,7 +376,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...]
             "make it again with `wavebatch survey -o`"
         )
     # The pulse that a residual loop takes from the survey where the chain names none.
-    step = prepared.job.chain.steps[2]
+    step = prepared.job.chain.decomposer
     if step.effective().get("model") == "auto":
         fitted = loop_model(prepared.system, "auto")
         lines.append(f'{step.stage.name} fits the pulse of the survey: model = "{fitted}"')

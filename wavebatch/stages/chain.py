@@ -303,6 +303,11 @@ class Chain:
             have.update(step.stage.makes)
         self.check(None)
 
+    @property
+    def decomposer(self) -> Step:
+        """The step that fits echoes."""
+        return self.steps[2]
+
     def check(self, system: SystemPulse | None) -> None:
         """Ask every stage whether it works in this chain.
 
@@ -425,7 +430,7 @@ class Chain:
         """The data of a step; attribute stages get the system with the pulse that the decomposer fitted."""
         system = solved.system
         if step.stage.kind == "attribute":
-            fitted = self.steps[2].fit_system(system)
+            fitted = self.decomposer.fit_system(system)
             other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
             system = replace(fitted, other_pulse=other)
         return {**solved._asdict(), "system": system}

@@ -310,7 +310,7 @@ class ChainRun:
     def add(self, block: WaveformBlock, found: _Found, both: np.ndarray) -> None:
         """Adds the result of a block; both: waveforms in which the other side has an echo, bool (n,)."""
         number = found.echoes.count(len(block))
-        misfit, floor = measure_fit(found.block, found.noise, found.system, self.chain.steps[2], found.echoes)
+        misfit, floor = measure_fit(found.block, found.noise, found.system, self.chain.decomposer, found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
         # All waveforms of the block, so that those without an echo count too.
         keys = np.zeros(len(block), pairing.PACKET_DTYPE)

@@ -34,7 +34,7 @@ def amplitude(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
 
 def _need_free_skew(step: Step, chain: Chain, system: SystemPulse | None) -> str:
     """Refuse a chain in which no skew is fitted to single echoes."""
-    decomposer = chain.steps[2]
+    decomposer = chain.decomposer
     free = decomposer.stage.name == "decompose.skewed" and decomposer.effective()["kappa"] == "free"
     if free or "skew" in decomposer.stage.makes:
         return ""
@@ -97,7 +97,7 @@ def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: Echo
 
 def _need_one_pulse(step: Step, chain: Chain, system: SystemPulse | None) -> str:
     """Refuse decomposers that fit another pulse to every echo: none is common to compare with."""
-    decomposer = chain.steps[2]
+    decomposer = chain.decomposer
     own = decomposer.effective().get("kappa") == "free" or decomposer.effective().get("model") == "generalized"
     if own or "skew" in decomposer.stage.makes or decomposer.stage.name == "decompose.generalized_gaussian":
         return f"{decomposer.stage.name} fits another shape to every echo; use it after decompose.adaptive"
@@ -286,7 +286,7 @@ _REASON = f"incidence_angle{SUFFIX}"
 
 def _check_widths(step: Step, chain: Chain, system: SystemPulse | None) -> str:
     """Refuse decomposers whose widths never are those of one pulse."""
-    decomposer = chain.steps[2]
+    decomposer = chain.decomposer
     name = decomposer.stage.name
     if "skew" in decomposer.stage.makes or decomposer.effective().get("kappa") == "free":
         return f"{name} fits a skew per echo, which takes part of the width; use decompose.adaptive"

@@ -501,7 +501,7 @@ def _compare_decomposers(
     warnings: list[str],
 ) -> float:
     """By how much energies of the strip's chain differ from those of the calibration's, relative; 0 for one chain."""
-    own = None if chain is None else chain.steps[2].stage.name
+    own = None if chain is None else chain.decomposer.stage.name
     other = STAGES.get(calibration.decomposer)
     if chain is None or other is None or own == calibration.decomposer:
         return 0.0

@@ -25,7 +25,7 @@ from wavebatch.core.order import median, quantile
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.toml_file import TomlTable, check_number, describe_record, list_comments, read_record
+from wavebatch.files.toml_file import TomlTable, check_number, describe_record, read_record
 
 MOST_FIGURE = 1e30
 """Largest figure of a survey: far above counts and times, far below what overflows when it is squared."""
@@ -214,7 +214,7 @@ def read_figures(table: TomlTable) -> Figures:
 MOST_COMPONENTS = 16
 """Gaussians that a pulse in a file may have."""
 
-_DIGITIZERS, _INDEX = "digitizers", "index"
+DIGITIZERS, _INDEX = "digitizers", "index"
 REMEDY = "`wavebatch survey STRIP -o FILE` writes all"
 """What to do where a key is missing."""
 
@@ -222,24 +222,18 @@ REMEDY = "`wavebatch survey STRIP -o FILE` writes all"
 def describe_system(system: SystemPulse) -> dict[str, Any]:
     """Return the system pulse as plain numbers, lists and dictionaries under the keys of the file; exact."""
     own = [{_INDEX: index, **describe_record(other)} for index, other in sorted(system.digitizers.items())]
-    return {**describe_record(system), **({_DIGITIZERS: own} if own else {})}
-
-
-def comment_system() -> dict[str, str]:
-    """Return the comments of a file by dotted key."""
-    nested = f"system.{_DIGITIZERS}"
-    return list_comments(SystemPulse, "system", nested) | {nested: "a digitizer that records otherwise"}
+    return {**describe_record(system), **({DIGITIZERS: own} if own else {})}
 
 
 def read_system(table: TomlTable) -> SystemPulse:
     """Read the table [system] with those of the digitizers that record otherwise; raises ConfigError."""
     own: dict[int, SystemPulse] = {}
-    for row in table.tables(_DIGITIZERS, f"system.{_DIGITIZERS}"):
+    for row in table.tables(DIGITIZERS, f"system.{DIGITIZERS}"):
         index = row.integer(_INDEX, 1, 255)
         if index in own:
             raise ConfigError(f"{row.where}: {_INDEX} {index} has two tables; give each digitizer one")
         own[index] = _read_pulse(row, _INDEX)
-    return replace(_read_pulse(table, _DIGITIZERS), digitizers=own)
+    return replace(_read_pulse(table, DIGITIZERS), digitizers=own)
 
 
 def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:

@@ -23,7 +23,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import format_toml, parse_toml
+from wavebatch.files.toml_file import format_toml, list_comments, parse_toml
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.systems import figures as tables
@@ -181,7 +181,9 @@ def format_survey(saved: SavedSurvey) -> str:
         "decision": [{**asdict(decision), "needed": bool(decision.needed)} for decision in survey.decisions] or None,
         "fingerprint": saved.fingerprint or None,
     }
-    return format_toml(document, heading=_HEADING, comments=tables.comment_system())
+    others = f"system.{tables.DIGITIZERS}"
+    comments = list_comments(SystemPulse, "system", others) | {others: "a digitizer that records otherwise"}
+    return format_toml(document, heading=_HEADING, comments=comments)
 
 
 def load_survey(path: Path | str) -> SavedSurvey:

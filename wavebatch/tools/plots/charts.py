@@ -270,7 +270,7 @@ def measure_view_residuals(block: WaveformBlock, chain: Chain, system: SystemPul
     Samples that are missing, or at the digitizer's limit, are left out.
     """
     solved = chain.solve(block, system)
-    found = find_residual(solved.block, solved.noise, solved.system, chain.steps[2], solved.echoes)
+    found = find_residual(solved.block, solved.noise, solved.system, chain.decomposer, solved.echoes)
     if found is None:
         return np.full(len(block), np.nan)
     fit, residual, used = found

@@ -342,7 +342,7 @@ def build_views(
 ) -> list[WaveformView]:
     """One view per waveform of the block; packets: their numbers in the strip; show: as for `read_views`."""
     block, noise, system, echoes = chain.solve(block, system)
-    shape = fitted_pulse(chain.steps[2], system, block.spacing)
+    shape = fitted_pulse(chain.decomposer, system, block.spacing)
     level = clip_level(block, system)
     seen: Sequence[DetectorSignal | None] = [None] * len(block)
     if show is not None:
