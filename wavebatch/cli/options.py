@@ -80,15 +80,15 @@ def together(*options: Callable) -> Callable:
     return decorate
 
 
-_LENGTH_UNITS = {"m": 100.0, "cm": 1.0, "mm": 0.1}
+_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 
 
 def parse_length(text: str) -> float:
-    """A length in cm from text such as `0.02m`, `2cm`, `15 mm`; raises ConfigError for anything else."""
+    """A length in metres from text such as `0.02m`, `2cm`, `15 mm`; raises ConfigError for anything else."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m)\s*", text)
     if match is None or not float(match[1]) > 0:
         raise ConfigError(f"{text!r} is no length; write for example 0.02m, 2cm or 20mm")
-    return float(match[1]) * _LENGTH_UNITS[match[2]]
+    return float(match[1]) / _PER_METRE[match[2]]
 
 
 _SIZE_UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
@@ -150,7 +150,7 @@ def bbox_option(text: str) -> Callable:
 _READERS: dict[str, Callable[[str], Any]] = {
     "bbox": lambda text: parse_floats(text, "WEST,SOUTH,EAST,NORTH"),
     "lever_arm": lambda text: parse_floats(text, OPTIONS["lever_arm"].words.form),
-    "tolerance": lambda text: parse_length(text) / 100.0,
+    "tolerance": parse_length,
     "memory": _parse_size,
     "classes": _parse_classes,
     "where": _parse_where,
