@@ -216,7 +216,7 @@ def match_sides(
                 for block in blocks:
                     found = run.find(block)
                     run.add(block, found, np.zeros(len(block), bool))
-                    rows = found.rows(block)
+                    rows = found.rows()
                     rows["gps_time"] = block.gps_time[found.echoes.waveform]
                     task.add(1 - side, rows)
                 between = task.finish(a.name, b.name)
@@ -229,9 +229,9 @@ def match_sides(
                 for key, run in runs.items():
                     other = number.get("b" if key == "a" else "a", np.zeros(len(block), np.int64))
                     run.add(block, found[key], other > 0)
-                sides = [found["a"].rows(block), found["a"].vendor_rows(block)]
+                sides = [found["a"].rows(), found["a"].vendor_rows()]
                 if "b" in found:
-                    sides = [one.rows_along(block) for one in found.values()]
+                    sides = [one.rows_along() for one in found.values()]
                 # All waveforms of the block, so that those without an echo count too.
                 keys = np.zeros(len(block), pairing.PACKET_DTYPE)
                 keys["gps_time"] = np.arange(len(block))
@@ -246,9 +246,9 @@ def match_sides(
 class _Found(Solved):
     """Noise and echoes of a chain in a block, as rows of clouds."""
 
-    def rows(self, block: WaveformBlock) -> np.ndarray:
+    def rows(self) -> np.ndarray:
         """The echoes as rows of a cloud; gps_time is the row of the waveform in the block."""
-        echoes = self.echoes
+        block, echoes = self.block, self.echoes
         rows = np.zeros(len(echoes), CLOUD_DTYPE)
         rows["gps_time"] = echoes.waveform
         rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
@@ -261,20 +261,20 @@ class _Found(Solved):
             rows[name] = echoes.attributes[name]
         return rows
 
-    def rows_along(self, block: WaveformBlock) -> np.ndarray:
+    def rows_along(self) -> np.ndarray:
         """The echoes on a vertical line, with distances that follow from their times.
 
         Positions would not do: an echo that matches a return lies on the return, whatever the chain has fitted.
         """
-        rows = self.rows(block)
+        rows = self.rows()
         rows["ray"] = rows["xyz"] = 0.0
         rows["xyz"][:, 2] = -AIR_SPEED * self.echoes.time
         rows["echo_time"] = np.nan  # the distances are these times: they would be compared twice
         return rows
 
-    def vendor_rows(self, block: WaveformBlock) -> np.ndarray:
+    def vendor_rows(self) -> np.ndarray:
         """The returns of the block as rows of a cloud; the amplitude is that of the sample nearest to the return."""
-        returns = block.returns
+        block, returns = self.block, self.block.returns
         rows = np.zeros(0 if returns is None else len(returns), CLOUD_DTYPE)
         if returns is None:
             return rows
@@ -287,10 +287,10 @@ class _Found(Solved):
         inside = np.flatnonzero((sample >= 0) & (sample < block.samples.shape[1]))
         waveform = returns.waveform[inside]
         at = sample[inside].astype(np.int64)
-        level = np.broadcast_to(self.noise.level, self.block.samples.shape)[waveform, at]
-        rows["amplitude"][inside] = self.block.samples[waveform, at] - level
-        if self.block.missing is not None:
-            rows["amplitude"][inside[self.block.missing[waveform, at]]] = np.nan
+        level = np.broadcast_to(self.noise.level, block.samples.shape)[waveform, at]
+        rows["amplitude"][inside] = block.samples[waveform, at] - level
+        if block.missing is not None:
+            rows["amplitude"][inside[block.missing[waveform, at]]] = np.nan
         return rows
 
 
@@ -315,7 +315,7 @@ class ChainRun:
         # All waveforms of the block, so that those without an echo count too.
         keys = np.zeros(len(block), pairing.PACKET_DTYPE)
         keys["gps_time"] = np.arange(len(block))
-        self.vendor.pair_by_time(found.rows(block), found.vendor_rows(block), keys)
+        self.vendor.pair_by_time(found.rows(), found.vendor_rows(), keys)
 
 
 def _rank(waveform: np.ndarray, time: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
