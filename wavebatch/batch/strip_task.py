@@ -60,13 +60,15 @@ class StripTask:
         self.alone = alone
         self.pending: deque[Future] = deque()
         self._takers: deque[Callable[[Any], None]] = deque()
-        """Who takes the result of each."""
+        """Methods that take the results of `pending`, in its order."""
         self.prepared: Prepared | None = None
         self.written = 0
+        """Units whose results were taken."""
         self.outdated = ""
         """Why a cloud that has a report is made again."""
         self._options = options
         self._submitted = 0
+        """Units that were submitted."""
         self._blob = b""
         self._claim: Claim | None = None
         self._writer: CloudWriter | None = None
@@ -74,11 +76,13 @@ class StripTask:
         self._runs: deque[tuple[int, int]] = deque()
         """Units that several processes scan, not yet submitted; empty where one process scans the strip."""
         self._scanned: list[ScanPart] = []
+        """What these have found so far."""
         self._packing = Packing()
         self._report = RunReport()
         self._described: dict[str, Any] = {}
         self._files: list[Path] = []
         self._state: list[tuple[int, int]] = []
+        """Size and time of these files when the work began."""
 
     def claim(self) -> None:
         """Keep other runs from making these outputs until the end; raises InputError while another one makes them."""
