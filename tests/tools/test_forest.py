@@ -162,7 +162,7 @@ def test_footprints_that_show_no_gaps_are_named_and_kept_with_the_voxels(tmp_pat
 def test_voxels_that_laspy_writes_again_keep_what_is_not_known(tmp_path):
     """laspy drops the declarations of no-data: a leaf area of 1.1 was 0 +- 6969, in layers up to 150 m."""
     simulate_strip("forest", tmp_path / "s.las", pulses=3000)
-    voxelize_strip(tmp_path / "s.las", tmp_path / "v.laz", VoxelOptions(1.0, QUICK, forest=True))
+    voxelize_strip(voxel_job(tmp_path / "s.las"), tmp_path / "v.laz", VoxelOptions(1.0, QUICK, forest=True))
     voxels = laspy.read(tmp_path / "v.laz")
     assert (voxels["attenuation"] == -9999).any()
     voxels.add_extra_dim(laspy.ExtraBytesParams("mine", np.float32))
