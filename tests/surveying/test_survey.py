@@ -453,6 +453,17 @@ def test_few_isolated_echoes_are_a_guess_where_pulses_do_not_agree(waveforms, wi
 
 
 @pytest.mark.parametrize(
+    ("waveforms", "width", "echoes", "said"),
+    [(60, 0.06, 0.06, 1), (60, 0.06, 0.04, 0), (60, 0.04, 0.12, 0), (60, None, 0.12, 0), (120, 0.06, 0.12, 0)],
+)
+def test_of_few_waveforms_both_width_and_echoes_in_doubt_are_a_guess(waveforms, width, echoes, said):
+    figures = Figures(isolated_echoes=20, width_in_doubt=width, echoes_in_doubt=echoes)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0, by_kind={"quiet": 1.0}))
+    texts = [one.text for one in doubt_survey(system, figures, waveforms)]
+    assert len(texts) == said and all("found 6 % of the echoes in doubt: the system pulse" in one for one in texts)
+
+
+@pytest.mark.parametrize(
     ("made", "waveforms", "alone", "echoes", "code"),
     [
         (0.05, 100, 50, 0.0, "noise-guess"), (0.02, 500, 50, 0.0, None), (0.05, 60, 50, 0.0, None),  # 3 such echoes

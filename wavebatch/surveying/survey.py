@@ -39,6 +39,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
+    LEAST_HELD,
     MIN_SNR,
     RESIDUAL_LOOK,
     SMALL,
@@ -317,7 +318,11 @@ def _survey(
             system, echoes = cover_repeated(part, system, echoes)
         fixed_share = share_fixed(echoes, len(part), block.spacing)
         figures.width_in_doubt = choice.spread
-        figures.echoes_in_doubt = max(choice.doubt, doubt, left, repeated_share, fixed_share)
+        # Neighbours too close to be found stay in the mirror too, but never beside so many of the strong echoes.
+        beside = mirror.beside - float(np.sqrt(mirror.beside)) if mirror.beside >= LEAST_HELD else 0.0
+        missed = beside / max(mirror.mains, 1)
+        shares = choice.doubt, doubt, left, repeated_share, fixed_share, missed if missed > MOST_DOUBTED else 0.0
+        figures.echoes_in_doubt = max(shares)
     else:
         part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)

@@ -248,7 +248,9 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         return
     # Known systems are read and compared only where that decides.
     known = (alone < FEW or (doubt or 0.0) > MOST_DOUBTED_KNOWN) and find_source(system) is not None
-    most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
+    # Waveforms that a pulse was learned from tell little against it: enough where width and echoes are both in doubt.
+    both = waveforms < HALVED and (figures.width_in_doubt or 0.0) > MOST_SPREAD
+    most = MOST_DOUBTED_KNOWN if known or both else MOST_DOUBTED
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
     # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms, and a shipped
     # pulse may be that of another sensor. Of more waveforms the judge knows the width, or that it does not.
