@@ -182,6 +182,15 @@ def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rng, tmp_pa
     assert "have no CRS" in said and "have a value" not in said, "50 of 210,000 cells: the raster is small"
 
 
+@pytest.mark.parametrize("crs", [(), ("--crs", "EPSG:32633")])
+def test_geocentric_coordinates_are_no_map(rng, tmp_path, crs):
+    """The raster of such a cloud was seen along the axis of the Earth, with distances from its equator for heights."""
+    xyz = np.array([4_373_387.0, 893_637.0, 4_540_743.0]) + rng.uniform(0, 20, (200, 3))
+    write_points(tmp_path / "a.las", xyz, offsets=(4e6, 9e5, 4e6), extra=[], vlrs=[])
+    result = _run(tmp_path / "a.las", "--column", "z", *crs, "-o", tmp_path / "x.tif", code=2)
+    assert "coordinates are geocentric" in result.stderr and result.stderr.count("\n") == 1
+
+
 RIPROCESS = (
     'PROJCS["UTM_North zone 33",GEOGCS["UTM_North zone 33",DATUM["WGS84",SPHEROID["WGS84",6378137.000,298.257223563]],'
     'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'

@@ -23,7 +23,7 @@ from wavebatch.core.schema import Above, CheckedOptions, Range, check_options, o
 from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, parse_crs
-from wavebatch.files.las.crs import read_crs_definition
+from wavebatch.files.las.crs import read_crs, read_crs_definition
 from wavebatch.files.las.header import read_header
 from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.kernels.physics.gap_probability import ASSUMED_ERROR
@@ -357,6 +357,10 @@ def write_grid(
         west, south, east, north = (value / options.size for value in options.bbox)
         borders = math.floor(west), math.floor(south), math.ceil(east), math.ceil(north)
         options = replace(options, bbox=tuple(border * options.size for border in borders))
+    for path in paths:
+        units = read_crs(path, read_checked_header(path, waveforms=False).header)[1]
+        if any(one.kind == "geocentric" for one in units):
+            raise ConfigError(f"{path}: coordinates are geocentric (ECEF): x and y are no map; project the clouds")
     crs, unit, unnamed = options.crs, "m", []
     if crs is not None:
         unit = find_crs_unit(crs, "--crs")
