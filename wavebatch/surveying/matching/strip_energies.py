@@ -56,8 +56,9 @@ and fewest periods that show it."""
 LEAST_COMPARED = 200
 """Pulses that show either."""
 
-PLACES, OF_PLACE, LEAST_PLACES = 32, 128, 8
-"""Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest."""
+PLACES, OF_PLACE, LEAST_PLACES, SMOOTH = 32, 128, 8, 3
+"""Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest; and
+degree of the curve that they follow."""
 
 LEAST_SAID, STUCK = 0.01, 0.9
 """Smaller errors are not named; and the scatter of a log over that of the calibration's from which it does not stand
@@ -323,13 +324,15 @@ def _compare_unknown(pulses: np.ndarray, chance: float) -> tuple[float, float]:
 def _compare_drift(places: list[np.ndarray], shots: float) -> float:
     """Error by slow changes of the log that the strip's brightness does not follow, relative; places: as `_join`;
     shots: scatter of the log from shot to shot, relative."""
-    found = []
+    found: list[np.ndarray] = []
+    every = [np.empty((4, 0))]
     for pulses in places:
         with np.errstate(invalid="ignore", divide="ignore"):
             both = np.log(pulses[1:3])
-        both = both[:, np.isfinite(both).all(axis=0)]
-        if both.size:
-            found.append(np.median(both, axis=1))
+        good = np.isfinite(both).all(axis=0) & np.isfinite(pulses[5:]).all(axis=0)
+        if good.any():
+            every.append(np.stack([np.full(good.sum(), len(found)), both[0, good] - both[1, good], *pulses[5:, good]]))
+            found.append(np.median(both[:, good], axis=1))
     light, sent = np.array(found).T if found else np.empty((2, 0))
     if len(sent) < LEAST_PLACES:
         return 0.0
@@ -342,4 +345,8 @@ def _compare_drift(places: list[np.ndarray], shots: float) -> float:
     rest = light - slope * sent
     # A field's border in the middle of the strip looks like a drift: parts beside each other are of one field.
     error = weigh_alike(rest) * math.sqrt(float(rest @ rest) / (len(sent) - 2) / float(sent @ sent))
+    # Or in cells of the ground, by a smooth curve through the log: its medians have what the light of their shots has.
+    number, rest, *place = np.concatenate(every, axis=1)
+    steady = np.polyval(np.polyfit(np.arange(len(sent)), sent, SMOOTH), number)
+    error, slope = min((error, slope), *find_growth_in_cells(steady, rest + steady, np.stack(place)))
     return slow * min(math.hypot(1.0 - slope, error), 1.0)
