@@ -113,9 +113,10 @@ class CStacked(ctypes.Structure):
 
     _fields_ = [
         *_fields(ctypes.c_int64, "n m"),
-        *_fields(_POINTER, "lag value weight low high"),
+        *_fields(_POINTER, "lag value weight"),
+        *_fields(ctypes.c_double * 3, "low high"),
         *_fields(ctypes.c_double, "early onset last end damping most_damping settled"),
-        *_fields(ctypes.c_int64, "most"),
+        *_fields(ctypes.c_int64, "most every"),
     ]
 
 

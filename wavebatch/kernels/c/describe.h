@@ -333,6 +333,7 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
     Desk d = {0};
     const int64_t vectors = VECTORS(w->length), rows = number + 2;
     int good = furnish(&d, rows, vectors);
+    int64_t *low = (int64_t *)d.matrix, *high = low + rows; /* vectors that a row reaches: 0 elsewhere */
     memset(matrix, 0, (number + 1) * (number + 1) * sizeof(double));
     memset(right, 0, (number + 1) * sizeof(double));
     for (int64_t i = 0; i < w->n && good; i++) {
@@ -349,7 +350,8 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
         }
         for (int64_t c = 0; c < number; c++) {
             lanes *row = d.rows + c * vectors;
-            for (int64_t v = 0; v < vectors; v++) row[v] = ALL(0);
+            memset(row, 0, vectors * sizeof(lanes));
+            low[c] = vectors; high[c] = 0;
             for (int64_t j = first; j < end; j++) {
                 double wide = w->width[j], more = wide * wide - reference * reference;
                 double sigma = sqrt(fmax(variance[c] + more, NARROWEST * variance[c]));
@@ -357,6 +359,7 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
                 float whole = rint(place), part = place - rint(place), inverse = 1 / sigma, height = w->amplitude[j] * wide / sigma;
                 int64_t from = at_most(at_least(place - REACH * sigma, 0), w->length) / LANES;
                 int64_t to = VECTORS((int64_t)at_most(at_least(place + REACH * sigma + 1, 0), w->length));
+                low[c] = from < low[c] ? from : low[c]; high[c] = to > high[c] ? to : high[c];
                 for (int64_t v = from; v < to; v++) {
                     lanes z = distance(d.x[v], whole, part, inverse);
                     row[v] += exp_lanes(z * z * -0.5f) * height;
@@ -364,12 +367,16 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
             }
         }
         for (int64_t v = 0; v < vectors; v++) d.rows[number * vectors + v] = ALL(1);
-        for (int64_t r = 0; r < rows; r++)
-            for (int64_t v = 0; v < vectors; v++) d.rows[r * vectors + v] *= d.weight[v];
-        multiply_rows(rows, vectors, d.rows, d.gram);
-        for (int64_t r = 0; r <= number; r++) {
-            for (int64_t c = 0; c <= r; c++) matrix[r * (number + 1) + c] += d.gram[r * rows + c];
-            right[r] += d.gram[(number + 1) * rows + r];
+        for (int64_t r = number; r < rows; r++) { low[r] = 0; high[r] = vectors; }
+        for (int64_t r = 0; r < rows; r++) {
+            lanes *row = d.rows + r * vectors;
+            for (int64_t v = low[r]; v < high[r]; v++) row[v] *= d.weight[v];
+            for (int64_t c = 0; c <= r && c <= number; c++) {
+                const int64_t from = low[c] > low[r] ? low[c] : low[r], to = high[c] < high[r] ? high[c] : high[r];
+                const double product = multiply(to - from, row + from, d.rows + c * vectors + from);
+                if (r <= number) matrix[r * (number + 1) + c] += product;
+                else right[c] += product;
+            }
         }
     }
     for (int64_t r = 0; r <= number; r++)

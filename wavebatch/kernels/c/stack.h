@@ -4,10 +4,10 @@
 typedef struct {
     int64_t n, m;                              /* lags, components */
     const double *lag, *value, *weight;
-    const double *low, *high;                  /* bounds of weight, place and sigma of each component */
+    double low[3], high[3];                    /* bounds of weight, place and sigma of a component */
     double early, onset, last, end;            /* no centre before `early` or two sigmas less `onset`, but before `last`; end of the stack */
     double damping, most_damping, settled;
-    int64_t most;                              /* evaluations */
+    int64_t most, every;                       /* evaluations; lags that a fit sees: each `every`-th */
 } Stacked;
 
 static double earliest(const Stacked *s, double sigma) { return fmin(fmax(s->early, 2 * sigma - s->onset), s->last); }
@@ -72,7 +72,7 @@ static void step_stacked(const Stacked *s, double damping, const double *normal,
     double largest = 1e-300;
     memcpy(matrix, normal, size * size * sizeof(double));
     for (int64_t a = 0; a < size; a++) {
-        const int held = (at[a] <= s->low[a] && downhill[a] < 0) || (at[a] >= s->high[a] && downhill[a] > 0);
+        const int held = (at[a] <= s->low[a % 3] && downhill[a] < 0) || (at[a] >= s->high[a % 3] && downhill[a] > 0);
         there[a] = held ? 0 : downhill[a];
         for (int64_t b = 0; held && b < size; b++) matrix[a > b ? a * size + b : b * size + a] = 0;
         largest = fmax(largest, matrix[a * size + a]);
@@ -83,39 +83,57 @@ static void step_stacked(const Stacked *s, double damping, const double *normal,
     }
     factor(size, matrix, pivot, 0);
     solve(size, matrix, there);
-    for (int64_t a = 0; a < size; a++) there[a] = fmin(fmax(at[a] + there[a], s->low[a]), s->high[a]);
+    for (int64_t a = 0; a < size; a++) there[a] = fmin(fmax(at[a] + there[a], s->low[a % 3]), s->high[a % 3]);
 }
 
-/* Fits in place; at (3 m). */
-INLINE int64_t fit_stack_any(const Stacked *s, double *at) {
-    const int64_t size = 3 * s->m, rows = s->m * s->n;
-    const int64_t stride = size + 4 * LANES;
-    double *memory = calloc(2 * rows + s->n * (1 + stride) + 2 * size * size + 3 * size + 1, sizeof(double));
+/* Fits each of some starts, (starts, 3 m): weight, delay and sigma of each component, in place. Returns the one that misses
+   all lags least, whatever their weights. */
+INLINE int64_t fit_stack_any(const Stacked *all, int64_t starts, double *found) {
+    Stacked few = *all, *s = &few;
+    s->n = (all->n + all->every - 1) / all->every;
+    const int64_t size = 3 * s->m, rows = s->m * all->n, stride = size + 4 * LANES;
+    double *memory = calloc(2 * rows + all->n + s->n * (3 + stride) + 2 * size * size + 3 * size + 1, sizeof(double)), least = INFINITY;
     if (!memory) return -1;
-    double *z = memory, *bell = z + rows, *rest = bell + rows, *normal = rest + s->n, *matrix = normal + size * size;
-    double *downhill = matrix + size * size, *pivot = downhill + size, *there = pivot + size, *table = there + size;
-    double cost = draw_stacked(s, at, z, bell, rest), damping = s->damping;
-    gather_stacked(s, at, z, bell, rest, stride, table, normal, downhill);
-    for (int64_t i = 1; i < s->most; i++) {
-        step_stacked(s, damping, normal, downhill, at, matrix, pivot, there);
-        const double found = draw_stacked(s, there, z, bell, rest);
-        if (found < cost) {
-            const int small = cost - found < s->settled * cost;
-            memcpy(at, there, size * sizeof(double));
-            cost = found;
-            damping = fmax(damping / 5, 1e-9);
-            if (small) break;
-            gather_stacked(s, at, z, bell, rest, stride, table, normal, downhill);
-        } else if (damping > s->most_damping) {
-            break;
-        } else {
-            damping *= 4;
+    double *z = memory, *bell = z + rows, *rest = bell + rows, *normal = rest + all->n, *matrix = normal + size * size;
+    double *downhill = matrix + size * size, *pivot = downhill + size, *there = pivot + size, *seen = there + size, *table = seen + 3 * s->n;
+    int64_t best = 0;
+    for (int64_t i = 0, j = 0; i < s->n; i++, j += all->every) {
+        seen[i] = all->lag[j];
+        seen[s->n + i] = all->value[j];
+        seen[2 * s->n + i] = all->weight[j];
+    }
+    s->lag = seen, s->value = seen + s->n, s->weight = seen + 2 * s->n;
+    for (int64_t start = 0; start < starts; start++) {
+        double *at = found + start * size, missed = 0;
+        for (int64_t a = 1; a < size; a += 3) at[a] = (at[a] - earliest(s, at[a + 1])) / (s->end - earliest(s, at[a + 1]));
+        for (int64_t a = 0; a < size; a++) at[a] = fmin(fmax(at[a], s->low[a % 3]), s->high[a % 3]);
+        double cost = draw_stacked(s, at, z, bell, rest), damping = s->damping;
+        gather_stacked(s, at, z, bell, rest, stride, table, normal, downhill);
+        for (int64_t i = 1; i < s->most; i++) {
+            step_stacked(s, damping, normal, downhill, at, matrix, pivot, there);
+            const double lower = draw_stacked(s, there, z, bell, rest);
+            if (lower < cost) {
+                const int small = cost - lower < s->settled * cost;
+                memcpy(at, there, size * sizeof(double));
+                cost = lower;
+                damping = fmax(damping / 5, 1e-9);
+                if (small) break;
+                gather_stacked(s, at, z, bell, rest, stride, table, normal, downhill);
+            } else if (damping > s->most_damping) {
+                break;
+            } else {
+                damping *= 4;
+            }
         }
+        if (starts > 1) draw_stacked(all, at, z, bell, rest);
+        for (int64_t i = 0; i < all->n; i++) missed += rest[i] / all->weight[i] * (rest[i] / all->weight[i]);
+        if (missed < least) { least = missed; best = start; }
+        for (int64_t c = 1; c < size; c += 3) at[c] = earliest(s, at[c + 1]) + at[c] * (s->end - earliest(s, at[c + 1]));
     }
     free(memory);
-    return 0;
+    return best;
 }
-OFFER(fit_stack, (const Stacked *s, double *at), (s, at))
+OFFER(fit_stack, (const Stacked *all, int64_t starts, double *found), (all, starts, found))
 
 /* The main lobe of pulses is looked for within LOBE widths of the main component, in COARSE steps per width; HALVINGS
    steps then find its peak and edges, to 1e-7 of such a step. */

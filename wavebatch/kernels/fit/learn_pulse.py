@@ -5,6 +5,7 @@ The loops of the fit are C (kernels/c/stack.h).
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -126,11 +127,13 @@ class PulseFit(NamedTuple):
         return drawn / drawn.max()
 
 
-def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0) -> list[PulseFit]:
+def fit_gaussians(
+    stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0, every: int = 1
+) -> list[PulseFit]:
     """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more.
 
     One that gains less is kept where the next one after it makes up for both. Where one Gaussian reaches the goal, a
-    misfit in amplitudes, no more are fitted.
+    misfit in amplitudes, no more are fitted. Starts are compared by fits to each `every`-th lag.
     """
     weight = _weights(stack)
     parameters = np.array([1.0, 0.0, width])
@@ -161,8 +164,7 @@ def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal:
         ]
         sharper = np.r_[parameters, -0.2, parameters[1], 1.3 * around]
         sharper[0] += 0.2
-        tried = [_refine(stack, weight, start, TRIAL_EVALUATIONS) for start in (*starts, sharper)]
-        parameters = min(tried, key=lambda p: float(np.sum((_sum(p, stack.lag) - stack.value) ** 2)))
+        parameters = _refine(stack, weight, np.stack((*starts, sharper)), TRIAL_EVALUATIONS, every)
 
 
 def refine_gaussians(stack: Stack, components: np.ndarray) -> PulseFit:
@@ -208,32 +210,24 @@ def _sum(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     return np.einsum("bc,c->b", exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2), weight)
 
 
-def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = MOST_EVALUATIONS) -> np.ndarray:
-    """The sum of Gaussians fitted from a start, in at most `most` evaluations.
+def _refine(
+    stack: Stack, weight: np.ndarray, starts: np.ndarray, most: int = MOST_EVALUATIONS, every: int = 1
+) -> np.ndarray:
+    """The sum of Gaussians that misses the stack least of those fitted from some starts (k, 3 c).
 
-    The parameters are weight, place and sigma; the place is the delay as a share of the way from the earliest that is
-    allowed to a component of this sigma to the end of the stack. Beyond the end nothing holds a component.
+    In at most `most` evaluations of each `every`-th lag. Parameters are weight, delay and sigma of each; fits move the
+    delay as a share of the way from the earliest that is allowed to a component of this sigma to the end of the stack.
+    Beyond the end nothing holds a component.
     """
-    width, end, number = abs(start[2]), stack.lag[-1], len(start) // 3
-    low = np.tile([-DEEPEST, 0.0, 0.35 * width], number)
-    high = np.tile([2.0, 1.0, 12.0 * width], number)
-    early, onset, last = -EARLIEST * width, ONSET * width, end - width
-
-    def earliest(sigma: np.ndarray) -> np.ndarray:
-        return np.minimum(np.maximum(early, 2 * sigma - onset), last)
-
-    found, begin = start.copy(), earliest(start[2::3])
-    found[1::3] = (start[1::3] - begin) / (end - begin)
-    found = np.clip(found, low, high)
+    found = np.array(starts, np.float64, ndmin=2)
+    width, end = abs(found[0, 2]), stack.lag[-1]
     columns = [np.ascontiguousarray(column, np.float64) for column in (stack.lag, stack.value, weight)]
     structure = CStacked(
-        len(weight), number, *(place(column, np.float64) for column in (*columns, low, high)),
-        early, onset, last, end, FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED, most,
+        len(weight), found.shape[1] // 3, *(place(column, np.float64) for column in columns),
+        (-DEEPEST, 0.0, 0.35 * width), (2.0, 1.0, 12.0 * width), -EARLIEST * width, ONSET * width, end - width, end,
+        FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED, most, every,
     )  # fmt: skip
-    call("fit_stack", structure, found)
-    begin = earliest(found[2::3])
-    found[1::3] = begin + found[1::3] * (end - begin)
-    return found
+    return found[call("fit_stack", structure, ctypes.c_int64(len(found)), found)]
 
 
 def fit_bounded(
