@@ -121,8 +121,9 @@ class PooledNoise(NamedTuple):
 
 
 def estimate_noise(
-    signal: np.ndarray, reach: int, limit: float = 4.0, missing: np.ndarray | None = None, recovery: int = 0
-) -> PooledNoise:
+    signal: np.ndarray, reach: int, limit: float = 4.0, missing: np.ndarray | None = None, recovery: int = 0,
+    begin: np.ndarray | None = None,
+) -> PooledNoise:  # fmt: skip
     """Level, variance and correlation of the samples before the first and after the last signal of each waveform.
 
     Parameters
@@ -137,6 +138,8 @@ def estimate_noise(
         Samples that were not recorded; a waveform without any other does not count.
     recovery : int, samples
         Until the level is back after strong signal, where it is known; else it is measured.
+    begin : float64 (k,), optional
+        Covariance of quiet samples 0, 1, 2, ... apart, as fewer waveforms show it: the first round only needs levels.
 
     Returns
     -------
@@ -160,28 +163,29 @@ def estimate_noise(
         signal = np.where(missing, np.float32(np.nan), signal)
         signal = np.where(missing, known_median(signal, 0), signal)
     signal = signal.astype(np.float32)
-    known = _estimate_from(signal, reach, limit, missing, recovery) if recovery else None
+    known = _estimate_from(signal, reach, limit, missing, recovery, begin=begin) if recovery else None
     if known is not None and known.share > 0:
         return known
-    found = _estimate_from(signal, reach, limit, missing, 0)
+    found = _estimate_from(signal, reach, limit, missing, 0, begin=begin)
     recovery = measure_recovery(signal, found, reach, limit, missing) if found.share else 0
     if not recovery:
         return found
-    again = _estimate_from(signal, reach, limit, missing, recovery)
+    again = _estimate_from(signal, reach, limit, missing, recovery, begin=begin)
     return again if again.share > 0 else found
 
 
 def _estimate_from(
-    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None, recovery: int, room: float = 1.0
-) -> PooledNoise:
+    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None, recovery: int, room: float = 1.0,
+    begin: np.ndarray | None = None,
+) -> PooledNoise:  # fmt: skip
     """The noise of quiet samples, found from each other from the quiet edges on.
 
     room: standard deviations by which the first level, that of few samples, may be wrong; 0 with a limit that comes
     from such noise.
     """
     level, std = quiet_edges(signal, missing)
-    covariance = np.array([std**2])
-    number = np.zeros(len(level), np.int32)
+    covariance = np.array([std**2]) if begin is None else begin
+    number, least = np.zeros(len(level), np.int32), signal == signal.min()
     for turn in range(ROUNDS):
         last = _smoothed_std(covariance)
         width = limit * (last + (0.0 if turn else room * std)) + 0.25
@@ -207,8 +211,12 @@ def _estimate_from(
             if high - low > CHANCE * np.sqrt(high + low):
                 calm = quiet & find_ends(means, float(bound), reach // 2, 0)
                 quiet = calm if np.count_nonzero(calm[1:] & calm[:-1]) >= LEAST_PAIRS else quiet
-        above = signal - np.nan_to_num(level)
+        if np.isnan(level).any():
+            above = signal - np.nan_to_num(level)
         mean, number = quiet_mean(above, quiet)
+        if begin is not None and not turn:
+            level = np.where(number > 0, np.nan_to_num(level) + mean, np.float32(np.nan))
+            continue
         # Waveforms whose quiet samples scatter like those of most others: the foot of an echo may be below a limit.
         deviation = above - mean
         power = np.einsum("sn,sn->n", deviation * quiet, deviation) / np.maximum(number, 1)
@@ -219,7 +227,7 @@ def _estimate_from(
         measured = measure_covariance(signal, used, lags)
         # Noise that is rounded off or cut off is not as often above its level as below it; too few samples hide it.
         many = np.count_nonzero(used)
-        cut = many < ENOUGH or np.count_nonzero(used & (signal == signal.min())) > MOST_LEAST * many
+        cut = many < ENOUGH or np.count_nonzero(used & least) > MOST_LEAST * many
         if measured is not None and not cut and measured[0] >= ROUNDED**2:
             # The level of most, or where these scatter by more than the noise its own.
             centre = np.nan_to_num(level) + mean
@@ -264,7 +272,7 @@ def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float
         return 1.0
     # Counts are whole: where noise stays on two of them their median is one, and either side would be an echo's.
     values = values - median(values + (np.arange(len(values)) * DITHER[0] % 1).astype(np.float32)) + np.float32(0.5)
-    above, below = (float(np.sum(np.square(values[side]), dtype=np.float64)) for side in (values > 0, values < 0))
+    above, below = (float(np.sum(np.square(side, dtype=np.float64))) for side in (values.clip(0), values.clip(max=0)))
     return above / max(below, 1e-12)
 
 
@@ -353,11 +361,8 @@ def _leave_signal_out(
     """
     s, n = signal.shape
     above = np.where(quiet, signal - level, np.float32(0))
-    # Smoothed counts are multiples of 1/4: without a dither of it one of the limits is nearer than the other.
-    down, across = (np.arange(size) * float(step) % 1 for step, size in zip(DITHER, (s, n), strict=True))
-    dither = down[:, None].astype(np.float32) + across.astype(np.float32)
-    dither -= dither >= 1
-    smoothed = smooth_121(above) + np.float32(0.25) * (dither - np.float32(0.5))
+    smoothed = smooth_121(above)
+    smoothed += _dither(s, n)
     limit, reach, number = np.float32(HIGH * std), -(-lags // 6), quiet.sum(axis=0)
     calm = ~(quiet & (np.abs(smoothed) > limit)).any(axis=0) & (number > 0)
     if calm.any():
@@ -378,6 +383,15 @@ def _leave_signal_out(
     share, size = (SKEWED - 1) * least / (most - least), max(len(plain), len(mirrored))
     longer = [np.pad(one, (0, size - len(one))) for one in (plain, mirrored)]
     return share * longer[0] + (1 - share) * longer[1]
+
+
+@lru_cache(maxsize=1)
+def _dither(s: int, n: int) -> np.ndarray:
+    """Smoothed counts are multiples of 1/4: without a dither of it one of two limits is nearer than the other (s, n)."""
+    down, across = (np.arange(size) * float(step) % 1 for step, size in zip(DITHER, (s, n), strict=True))
+    dither = down[:, None].astype(np.float32) + across.astype(np.float32)
+    dither -= dither >= 1
+    return np.float32(0.25) * (dither - np.float32(0.5))
 
 
 def measure_covariance(
