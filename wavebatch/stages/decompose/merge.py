@@ -54,18 +54,24 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
     """
     if not system.hidden:
         return table
-    wider, alone = np.maximum(excess_variance(table, system), 0.0), table.alone(n)
+    wider = excess_variance(table, system)
+    at = np.flatnonzero(wider > 0)  # others hide nothing
+    wider, part, alone = wider[at], table.take(at), table.alone(n)[at]
     known = (system.hidden, system.hidden_light, system.hidden_width)
     tables = (np.array(rows or ((0.0, 0.0, 0.0),)) for rows in known)
     late, share, width = (np.where(alone, *interpolate(wider, rows[:, 0], rows[:, 1:]).T) for rows in tables)
     light = share * np.sqrt(wider)  # of amplitude and energy alike
     covered = {
-        "time_err": np.sqrt(table.time_err**2 + late * wider * system.sigma_ref**2),
-        "amplitude_err": np.hypot(table.amplitude_err, light * table.amplitude),
-        "relative_energy_err": np.hypot(table.relative_energy_err, light),
-        "sigma_err": np.hypot(table.sigma_err, width * np.sqrt(wider) * table.sigma),
+        "time_err": np.sqrt(part.time_err**2 + late * wider * system.sigma_ref**2),
+        "amplitude_err": np.hypot(part.amplitude_err, light * part.amplitude),
+        "relative_energy_err": np.hypot(part.relative_energy_err, light),
+        "sigma_err": np.hypot(part.sigma_err, width * np.sqrt(wider) * part.sigma),
     }
-    return replace(table, **{name: error.astype(np.float32) for name, error in covered.items()})
+    for name, error in covered.items():
+        column = getattr(table, name).copy()
+        column[at] = error
+        covered[name] = column
+    return replace(table, **covered)
 
 
 def excess_variance(table: EchoTable, system: SystemPulse) -> np.ndarray:
