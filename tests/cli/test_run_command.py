@@ -156,7 +156,7 @@ SURVEYS = "wavebatch.surveying.survey wavebatch.surveying.flight wavebatch.surve
         ("plot map --help", "laspy matplotlib"),
         ("info STRIP", "laspy scipy wavebatch.stages wavebatch.surveying.survey"),
         ("run STRIP -o OUT --system SYSTEM", f"{SURVEYS} laspy pyproj requests urllib3 numpy.ma scipy dask {PAGES}"),
-        ("survey STRIP", f"wavebatch.batch.run laspy pyproj numpy.ma scipy {PAGES}"),
+        ("survey STRIP", f"wavebatch.batch.run laspy pyproj numpy.ma numpy.random scipy {PAGES}"),
     ],
 )
 def test_commands_import_only_what_they_use(tmp_path, tiny_strip, command, unused):

@@ -129,7 +129,7 @@ def test_a_survey_decides():
 def test_waveforms_are_simulated_again_with_the_noise_that_fits_whiten():
     system = whiten(system_of())
     block, _ = record(500, (100.0,))
-    again, _ = simulate_again(block, system, EchoTable.empty(), np.random.default_rng(1))
+    again, _ = simulate_again(block, system, EchoTable.empty(), 1)
     noise = again.samples - 200.0
     assert noise.std() == pytest.approx(system.noise.quiet, rel=0.03)
     for lag, share in ((1, RHO), (2, RHO**2), (4, RHO**4)):

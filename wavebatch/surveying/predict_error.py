@@ -15,11 +15,11 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable, without_nan
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import distinct
+from wavebatch.core.order import distinct, draw
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import bound_time
-from wavebatch.kernels.signal.noise import whitening_filter
+from wavebatch.kernels.signal.noise import normal_law, whitening_filter
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.decompose.merge import excess_variance
@@ -34,6 +34,9 @@ TRIAL_WAVEFORMS = 2048
 
 SEED = 20071
 """Seed of a trial's noise: any fixed number does."""
+
+QUANTILES = 16_384
+"""Of normal noise, from which that of a trial is drawn: its variance is right to 1e-4."""
 
 LEAST_SNR = 5.0
 """Least amplitude over noise of an echo of the sample: below it, noise would pass for echoes with huge bounds."""
@@ -97,7 +100,7 @@ def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[st
     truth = adaptive(block, noise, system, maximum(block, noise, system))
     sure = truth.amplitude >= LEAST_SNR * noise.std[truth.waveform]
     truth = truth.take(np.flatnonzero(sure & ((truth.flags & int(_DOUBTFUL)) == 0)))
-    trial, system = simulate_again(block, system, truth, np.random.default_rng(SEED))
+    trial, system = simulate_again(block, system, truth, SEED)
     bounds = bound_time(truth.amplitude, truth.sigma.astype(np.float64), system.noise.std, block.spacing) * HALF_C
     bound = _rms(bounds)
     predictions = []
@@ -132,7 +135,7 @@ def leave_out_false(predictions: Sequence[Prediction]) -> list[Prediction]:
 
 
 def simulate_again(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rng: np.random.Generator, length: int | None = None
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, seed: int, length: int | None = None
 ) -> tuple[WaveformBlock, SystemPulse]:
     """Simulate waveforms that hold given echoes, with the strip's pulse, new baselines and new noise.
 
@@ -143,7 +146,8 @@ def simulate_again(
     system : SystemPulse
     echoes : EchoTable
         Their rows refer to `block`.
-    rng : numpy.random.Generator
+    seed : int
+        Of the noise.
     length : int, optional
         Samples of a waveform; by default as many as in the block.
 
@@ -159,7 +163,10 @@ def simulate_again(
     white = max(system.noise.std**2 - QUANTISATION_STD**2, 0.0)
     variance = white + system.noise.gain * np.maximum(signal, 0)
     # Noise that fits of this system see with a standard deviation of 1: coloured where they whiten it.
-    noise = rng.standard_normal((n, s), dtype=np.float32)
+    z, below, _ = normal_law()
+    normal = np.interp((np.arange(QUANTILES) + 0.5) / QUANTILES, below, z).astype(np.float32)
+    noise = normal[(QUANTILES * draw(seed, n, s + 1)).astype(np.int64)]
+    noise, level = noise[:, :s], noise[:, s:]
     if system.noise.whitening:
         rows = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet).astype(np.float32)
         for i in range(s):
@@ -168,7 +175,7 @@ def simulate_again(
                 noise[:, i] -= rows[before, j] * noise[:, i - j]
             noise[:, i] /= rows[before, 0]
     signal += np.sqrt(variance).astype(np.float32) * noise
-    signal += system.noise.baseline + system.noise.baseline_spread * rng.standard_normal((n, 1))
+    signal += system.noise.baseline + system.noise.baseline_spread * level
     top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
     # In double precision: 2^32 - 1 in single precision is 2^32, which no sample of 32 bits can hold.
     counts = np.clip(np.rint(signal.astype(np.float64)), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
@@ -283,15 +290,15 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     """Excess variance of pairs that are found as one echo, its distance to the nearer target [widths of the pulse] and
     the shares of its light and of its width that are not that target's.
     """
-    rng = np.random.default_rng(SEED)
     block = block.rows(slice(0, PAIRS))
     n, ref = len(block), system.sigma_ref
     length = min(block.samples.shape[1], LEVEL + int(np.ceil(AROUND * ref / block.spacing)))
-    half, chosen = 0.5 * FAR * ref * rng.random(n), rng.integers(0, len(echoes), 2 * n)
-    middle = block.spacing * (0.5 * length + rng.random(n))
+    apart, shift, *source = draw(SEED, 4, n)
+    half, middle = 0.5 * FAR * ref * apart, block.spacing * (0.5 * length + shift)
+    chosen = (len(echoes) * np.ravel(source)).astype(np.int64)
     time = np.stack([middle - half, middle + half], axis=1)
     pairs = EchoTable.build(np.repeat(np.arange(n), 2), time.ravel(), echoes.amplitude[chosen], echoes.sigma[chosen])
-    found = decompose_sample(*simulate_again(block, system, pairs, rng, length), free_levels=True)
+    found = decompose_sample(*simulate_again(block, system, pairs, SEED + 1, length), free_levels=True)
     one = found.alone(n) & (found.amplitude > CLEAR * system.noise.std)
     found = found.take(np.flatnonzero(one))
     away = np.abs(time[found.waveform] - found.time[:, None])

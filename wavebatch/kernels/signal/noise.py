@@ -387,7 +387,7 @@ def _leave_signal_out(
 
 @lru_cache(maxsize=1)
 def _dither(s: int, n: int) -> np.ndarray:
-    """Smoothed counts are multiples of 1/4: without a dither of it one of two limits is nearer than the other (s, n)."""
+    """A dither (s, n) of smoothed counts, multiples of 1/4: without it one of two limits is nearer than the other."""
     down, across = (np.arange(size) * float(step) % 1 for step, size in zip(DITHER, (s, n), strict=True))
     dither = down[:, None].astype(np.float32) + across.astype(np.float32)
     dither -= dither >= 1
@@ -819,7 +819,7 @@ NORMAL = 1.5
 
 def floor_share(level: float, std: float) -> float:
     """Share of normal noise that a digitizer records as 0."""
-    z, below, _ = _normal()
+    z, below, _ = normal_law()
     return float(np.interp((0.5 - level) / max(std, QUANTISATION_STD), z, below))
 
 
@@ -841,7 +841,7 @@ def floor_response(level: float, std: float) -> tuple[float, float, float]:
         Standard deviation after the cut.
     """
     cut = -level / std
-    z, *tables = _normal()
+    z, *tables = normal_law()
     below, density = (float(np.interp(cut, z, values)) for values in tables)
     mean = density + cut * below
     variance = 1 - below + cut * density + cut**2 * below - mean**2
@@ -875,7 +875,7 @@ def undo_floor(
     step = float(values[values > 0].min())
     upper = float(np.quantile(values, 0.5 + 0.5 * share, method="inverted_cdf"))
     shares = share, min(float(np.mean(values <= upper)), 1 - 0.5 / len(values))
-    z, below, _ = _normal()
+    z, below, _ = normal_law()
     low, high = np.interp(shares, below, z)
     whole = float(upper / (high - low))
     level = 0.5 * step - float(low) * whole
@@ -891,7 +891,7 @@ def undo_floor(
 
 
 @lru_cache
-def _normal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def normal_law() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Standard deviations from -8 to 8, the share of normal noise below them, and its density there."""
     z = np.linspace(-8.0, 8.0, 3201)
     density = exp(-0.5 * z * z) / sqrt(2 * pi)

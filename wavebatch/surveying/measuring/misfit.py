@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.order import distinct, median, quantile, quantiles
+from wavebatch.core.order import distinct, draw, median, quantile, quantiles
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
@@ -590,9 +590,9 @@ def _add_beside(
     low, high = log(np.array(HEIGHTS)).tolist()
     drawn_by_turn = []
     for turn in turns:
-        rng = np.random.default_rng(turn)
-        lag = rng.choice([-1, 1], each) * rng.uniform(NOT_ABSORBED - 1, BESIDE + 1, each)
-        drawn_by_turn.append((lag, rng.uniform(low, high, each)))
+        place, height = draw(turn, 2, each)
+        lag = (BESIDE + 2 - NOT_ABSORBED) * (2 * place - 1)  # of both signs
+        drawn_by_turn.append((lag + (NOT_ABSORBED - 1) * np.sign(lag), low + (high - low) * height))
     lag, height = (np.concatenate(values) for values in zip(*drawn_by_turn, strict=True))
     height = system.noise.std * exp(height)
     block = block.rows(np.tile(strong.waveform, len(turns)))
