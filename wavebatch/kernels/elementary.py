@@ -7,6 +7,7 @@ decides results uses these, and sums of products by `np.einsum`, which is the sa
 from __future__ import annotations
 
 import ctypes
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def log1p(x: np.ndarray | float) -> np.ndarray:
     rounded = one - 1.0
     exact = rounded == 0
     found = np.where(exact, x, log(one) * np.where(exact, 1.0, x) / np.where(exact, 1.0, rounded))
-    return found.astype(_kind(x), copy=False)
+    return found.astype(_KINDS.get(getattr(x, "dtype", None), np.float64), copy=False)
 
 
 def solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -75,12 +76,12 @@ def interpolate(x: np.ndarray, at: np.ndarray, table: np.ndarray) -> np.ndarray:
     return out
 
 
-def _kind(x: np.ndarray | float) -> type:
-    return np.float32 if getattr(x, "dtype", None) == np.float32 else np.float64
+_KINDS: dict[Any, type] = {np.dtype(np.float32): np.float32}
+"""Type of a result by that of the argument; float64 for any other."""
 
 
 def _apply(name: str, x: np.ndarray | float) -> np.ndarray:
     values = np.ascontiguousarray(x, np.float64)
     out = np.empty_like(values)
     call(name, ctypes.c_int64(values.size), values, out)
-    return out.reshape(np.shape(x)).astype(_kind(x), copy=False)[()]
+    return out.reshape(np.shape(x)).astype(_KINDS.get(getattr(x, "dtype", None), np.float64), copy=False)[()]

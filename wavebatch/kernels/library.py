@@ -366,7 +366,7 @@ def call(name: str, *arguments: Any) -> int:
         There is not enough for its largest waveform or window.
     """
     given = [
-        (ctypes.byref(_BYTE(part)) if part.size and part.flags.carray else ctypes.c_void_p(part.ctypes.data))
+        ctypes.c_void_p(address(part))
         if isinstance(part, np.ndarray)  # a survey calls 3,000 times
         else ctypes.byref(part) if isinstance(part, ctypes.Structure) else part
         for part in arguments
@@ -386,6 +386,7 @@ def place(array: np.ndarray, dtype: type) -> int:
 
 def address(array: np.ndarray) -> int:
     """Address of an array's first value; `array.ctypes.data` takes twice as long, and a survey asks 10,000 times."""
-    if array.size and array.flags.carray:
+    try:
         return ctypes.addressof(_BYTE(array))
-    return array.ctypes.data  # of what cannot be written, or is empty
+    except (TypeError, ValueError):  # of what cannot be written, or is empty
+        return array.ctypes.data
