@@ -42,9 +42,9 @@ TAIL_BEFORE, TAIL_AFTER = 15, 40
 BESIDE, NOT_ABSORBED = 10, 3
 """Widths of the pulse beside an echo up to which what is left is measured, and from which."""
 
-ADDED, MOST_TURNS = 512, 8
+ADDED, MOST_TURNS = 512, 32
 """Echoes that are added and found, some 100 within two widths of each lag, and how often they are tried: in a canopy
-hardly a place is free."""
+hardly a place is free. With 8 turns 54 to 65 % of NEON's waveforms were exact by the seed alone."""
 
 HEIGHTS = 10.0, 40.0
 """Amplitudes over noise of echoes that are added: found beside strong ones too, small enough to be moved by them."""
@@ -561,10 +561,12 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     if len(strong) < FEW:
         return system
     lags, offs, turn, number = [np.empty(0)], [np.empty(0)], 0, 0
-    while turn < MOST_TURNS and number < 2 * ADDED:
+    while turn < MOST_TURNS:
         # As many turns together as are missing, if the next ones are like those before: a call takes as long as 50 do.
         missing = (2 * ADDED - number) / max(number / turn if turn else 2 * len(strong), 1)
-        turns = range(turn, min(turn + int(np.ceil(missing)), MOST_TURNS))
+        turns = range(turn, min(turn + int(np.rint(missing if turn else max(missing, 1))), MOST_TURNS))
+        if not turns:  # less than half of one
+            break
         for lag, off in _add_beside(block, system, echoes, strong, turns):
             if number < 2 * ADDED:
                 lags, offs, number = [*lags, lag], [*offs, off], number + len(lag)
