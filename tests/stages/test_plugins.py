@@ -90,22 +90,6 @@ def test_a_chain_may_name_stages_of_a_plugin(installed):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("first_half", "first_haf", "unknown stage 'detect.first_haf'; did you mean 'detect.first_half'"),
-        ('first_half"\n', 'first_half"\nlevl = 3.0\n', "unknown key 'levl'; did you mean 'level'"),
-        ('first_half"\n', 'first_half"\nlevel = 10.0\n', "level must lie between 0.5 and 9, it is 10"),
-        ('first_half"\n', 'first_half"\nlevel = "high"\n', "level must be a number"),
-    ],
-)
-def test_stages_of_a_plugin_have_the_same_checks(installed, old, new, words):
-    installed("mine", GOOD)
-    with pytest.raises(wb.ConfigError, match=words) as caught:
-        parse_chain(CHAIN.replace(old, new), "mine.toml")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("source", "words"),
     [
         ("import no_such_module_at_all", "ModuleNotFoundError: No module named 'no_such_module_at_all'"),

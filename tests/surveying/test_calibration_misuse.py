@@ -39,7 +39,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.las.header import Vlr
 from wavebatch.files.strip.reader import PairScale, StripReader
-from wavebatch.kernels.physics.radiometry import attenuation_of_visibility, judge_energies
+from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration, parse_calibration
@@ -976,19 +976,6 @@ def test_an_incidence_that_contradicts_the_plane_of_the_target_is_refused(tmp_pa
     assert done.exit_code == 1 and "its incidence of 50 deg contradicts the plane of its echoes" in done.stderr
     right = write_field(tmp_path / "r.csv", "incidence=3")
     assert call("calibrate", calibrated / "a.las", "--targets", right, "-o", tmp_path / "cal.toml").exit_code == 0
-
-
-@pytest.mark.parametrize("scatter", [0.02, 0.08])
-def test_energies_of_other_pulses_are_noticed(rng, scatter):
-    ground = np.where(np.arange(4000) // 40 % 2, 0.1, 0.5)
-    energy = 1 + scatter * rng.standard_normal(4000)
-    light = ground * energy * (1 + 0.02 * rng.standard_normal(4000))
-    doubt, noise = judge_energies(light, 7.5 * energy)
-    assert doubt == "" and noise < 0.05
-    assert "one pulse too late" in judge_energies(light, np.roll(energy, 1))[0]
-    assert "one pulse too early" in judge_energies(light, np.roll(energy, -1))[0]
-    assert "they are of other pulses" in judge_energies(light, rng.permutation(energy))[0]
-    assert judge_energies(light, np.ones(4000)) == judge_energies(light, np.full(4000, np.nan)) == ("", 0.0)
 
 
 def test_a_shuffled_log_of_energies_is_refused(tmp_path, rng):
