@@ -258,7 +258,7 @@ def test_tools_leave_gaps_out(whole, tmp_path):
     chain = load_profile("balanced")
     profiles = deconvolve_block(block, system, Deconvolution())
     assert not profiles.value[block.missing].any() and profiles.seen.mean() > 0.3
-    values = _shape(block).values.reshape(len(block), -1)
+    values = _shape(block)[1]["value"].reshape(len(block), -1)
     assert np.isnan(values[block.missing]).all() and not np.isnan(values[~block.missing]).any()
     views = build_views(block.rows(slice(0, 40)), chain, system, list(range(40)))
     for view in views:
