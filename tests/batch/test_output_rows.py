@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections import defaultdict
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -411,7 +412,7 @@ def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):
 def test_the_last_chunk_holds_the_rows_that_are_left_be_it_one():
     packing = Packing()
     assert packing.is_empty and not packing.has_chunk(last=True)
-    packing.add(np.zeros(CHUNK_POINTS + 1))
+    packing.add(SimpleNamespace(count=CHUNK_POINTS + 1))
     assert packing.has_chunk(last=False)
     packing.next_chunk()
     assert not packing.has_chunk(last=False) and packing.has_chunk(last=True)
