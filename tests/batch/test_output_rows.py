@@ -11,13 +11,13 @@ from commands import refuses, run_command
 
 import wavebatch as wb
 from wavebatch.batch.options import OPTIONS, RunOptions
-from wavebatch.batch.output_rows import assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.output_rows import UnitEchoes, _find_copies, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.unit import CHUNK_POINTS, Packing, prepare_strip
-from wavebatch.core.echoes import COLUMNS, PASSED_THROUGH, Column, EchoFlag
+from wavebatch.core.echoes import COLUMNS, PASSED_THROUGH, Column, EchoFlag, EchoTable
 from wavebatch.core.errors import OF_FILES, StageError
 from wavebatch.files.las.header import split_numbers
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import PacketTable, StripReader
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
 from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.surveying.calibration import needs_sensor, with_columns
@@ -367,6 +367,19 @@ def test_packets_of_equal_time_are_one_pulse_where_they_lie_on_one_line(edit_poi
     else:
         np.testing.assert_array_equal(np.bincount(number), np.bincount(first))
         np.testing.assert_array_equal(np.bincount(total), np.bincount(most))
+
+
+def test_copies_of_copies_and_echoes_of_other_pulses_decide_nothing():
+    """Of each pulse three packets, an echo in each; the first has a return. Beside a copy a true echo was a copy too,
+    and narrow ones hid the copies behind them, except where another pulse of the unit had many."""
+    time, sigma = np.array([0.0, 1.5, 3.0, 0.0, 0.6, 1.0]), np.array([2.0, 2.0, 2.0, 2.0, 0.1, 2.0])
+    point = np.array([0, -1, -1, 3, -1, -1])
+    table = EchoTable.build(np.arange(6), time, np.ones(6), sigma, attributes={"point": point})
+    rays = UnitEchoes(table, point, np.ones(6, bool), np.tile([0.0, 0.0, -0.15], (6, 1)), np.zeros((6, 3)))
+    whole = np.arange(6), np.ones(6, bool)
+    packets = PacketTable(np.ones(6, np.uint8), *(np.arange(6),) * 3, *whole, np.ones(6, bool))
+    copied = _find_copies(SimpleNamespace(packets=packets, start=0), rays, np.array([0, 0, 0, 3, 3, 3]))
+    assert copied.tolist() == [False, True, False, False, False, True]
 
 
 def test_points_that_are_stored_twice_do_not_count_as_returns(edit_points, tmp_path):

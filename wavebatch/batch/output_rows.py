@@ -364,18 +364,22 @@ def _find_copies(unit: Unit, echoes: UnitEchoes, pulse: np.ndarray) -> np.ndarra
     time = table.time + shift[table.waveform]
     at = np.flatnonzero(np.isfinite(time))
     at = at[np.lexsort((table.waveform[at], time[at], key[table.waveform[at]]))]
-    added, behind = table.attributes["point"] < 0, 1
+    pairs, behind = [np.empty((2, 0), np.int64)], 1
     while behind < len(at):
         one, other = at[:-behind], at[behind:]
         near = key[table.waveform[one]] == key[table.waveform[other]]
-        near &= time[other] - time[one] <= np.minimum(table.sigma[one], table.sigma[other])
-        if not near.any():
+        if not near.any():  # no pulse has so many; what others have decides nothing
             break
-        near &= table.waveform[one] != table.waveform[other]
-        late = table.waveform[one] > table.waveform[other]
-        copied[one[near & added[one] & (late | ~added[other])]] = True
-        copied[other[near & added[other] & ~(late & added[one])]] = True
+        near &= time[other] - time[one] <= np.minimum(table.sigma[one], table.sigma[other])
+        pairs.append(np.stack([one, other])[:, near & (table.waveform[one] != table.waveform[other])])
         behind += 1
+    pair = np.concatenate(pairs, axis=1)
+    early, late = np.take_along_axis(pair, np.argsort(table.waveform[pair], axis=0), axis=0)
+    left = table.attributes["point"] < 0
+    for copy, of in ((late, early), (early, late)):
+        copied[copy[left[copy] & (table.attributes["point"][of] >= 0)]] = True
+    left &= ~copied  # what is a copy itself shows nothing
+    copied[late[left[late] & left[early]]] = True
     return copied
 
 
