@@ -1,6 +1,7 @@
 """CRS of strips, clouds, areas and GeoJSON: read, compared, written, and projected."""
 
 import json
+import re
 import shutil
 import struct
 import sys
@@ -37,6 +38,7 @@ from wavebatch.files.las.crs import (
     repair_wkt,
 )
 from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_projection, read_header
+from wavebatch.files.strip.packets import find_facts
 from wavebatch.files.strip.reader import StripReader, measure_scale
 from wavebatch.stages.attribute.basic import position
 from wavebatch.tools.scan_slices import Segment
@@ -461,6 +463,7 @@ def test_utm_zones(code, name, meridian, northing):
         ((geo_keys(k1024=1, k3072=2263),), "(EPSG:25832 and EPSG:2263) contradict"),
         (([build_wkt(build_utm(25833))],), "records of the CRS contradict"),
         ((geo_keys(k1024=1, k3072=32632), [build_wkt(build_utm(25832))]), ""),
+        (([build_wkt(build_utm(25832).replace(",", ", ") + "\n")],), ""),
     ],
 )
 def test_records_that_give_two_places_are_named(tmp_path, records, named):
@@ -472,6 +475,23 @@ def test_records_that_give_two_places_are_named(tmp_path, records, named):
         add_record(path, record)
     done = run_command("check", str(path))
     assert (done.exit_code, named in done.stdout) == (int(bool(named)), True), done.output
+
+
+@pytest.mark.parametrize(
+    ("wkt", "code", "named"),
+    [
+        ('COMPD_CS["c",{25833},VERT_CS["h",VERT_DATUM["d",2005],AUTHORITY["EPSG","5783"]]]', 25832, True),
+        ('COMPD_CS["c",{25832},VERT_CS["h",VERT_DATUM["d",2005],AUTHORITY["EPSG","5783"]]]', 25832, False),
+        ('PROJCS["n",UNIT["US survey foot",0.3048006],AUTHORITY["EPSG","2263"]]', 2263, False),
+        ('PROJCS["n",UNIT["foot",0.3048],AUTHORITY["EPSG","2263"]]', 2263, True),
+    ],
+)
+def test_compound_records_and_feet_are_compared(tmp_path, wkt, code, named):
+    path = tmp_path / "s.las"
+    simulate_strip("flat", path, pulses=300, seed=1)
+    add_record(path, build_wkt(re.sub(r"{(\d+)}", lambda found: build_utm(int(found[1])), wkt)))
+    add_record(path, *geo_keys(k1024=1, k3072=code))
+    assert any("contradict" in line for line in find_facts(path, "auto", False).warnings) == named
 
 
 @pytest.mark.parametrize("code", [32600, 32661, 25827, 25839, 26924, 31468, 4326, 0])

@@ -401,7 +401,7 @@ def metres_per_unit(units: Sequence[CrsUnits]) -> tuple[float, float, float]:
     return along, along, up
 
 
-_EPSG = r'(?:AUTHORITY|ID)\s*\[\s*"EPSG"\s*,\s*"?(\d+)"?\s*\]\s*\]\s*$'
+_EPSG = r'(?:AUTHORITY|ID)\s*\[\s*"EPSG"\s*,\s*"?(\d{1,9})"?\s*\]\s*\]\s*$'
 
 
 def find_epsg(wkt: str) -> int | None:

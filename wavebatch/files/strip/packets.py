@@ -14,6 +14,7 @@ toward the sensor; `toward=False` stores them the other way round.
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -97,11 +98,14 @@ def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:
     crs, units = read_crs(path, header)
     # Programs that convert a strip may leave the record of the kind that they do not write as it was.
     codes = [find_epsg(crs or ""), find_code(header.vlrs)]
-    zones = {wkt.partition("PROJECTION")[2].rpartition(",AUTHORITY")[0] for wkt in map(build_utm, filter(None, codes))
-             if wkt}  # fmt: skip
+    # A compound CRS has the code of the zone inside.
+    every = {codes[1] or 0, *map(int, re.findall(r'"EPSG"\s*,\s*"?(\d{4,5})\b', crs or ""))}
+    zones = {wkt.partition("PROJECTION")[2].rpartition(",AUTHORITY")[0] for wkt in map(build_utm, every) if wkt}
     wkts = [vlr.payload for vlr in header.vlrs if las.is_projection(vlr) and vlr.record_id == las.WKT_ID]
-    texts = {payload.rstrip(b"\0 ") for payload in wkts}
-    sizes = {round(unit.horizontal, 9) for unit in units if unit.horizontal and np.isfinite(unit.horizontal)}
+    words = ["".join(payload.split(b"\0")[0].decode("latin-1").split()) for payload in wkts]
+    texts = {find_epsg(text) or text for text in words}
+    # Survey feet are written with 7 digits too; international feet differ in the sixth.
+    sizes = {round(unit.horizontal, 7) for unit in units if unit.horizontal and np.isfinite(unit.horizontal)}
     if max(len(zones), len(texts), len(sizes)) > 1:
         said = f" (EPSG:{codes[0]} and EPSG:{codes[1]})" if all(codes) else ""
         odd.append(f"WKT and GeoTIFF records of the CRS{said} contradict each other: some programs show the strip in "
