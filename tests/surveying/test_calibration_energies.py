@@ -15,7 +15,7 @@ from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.matching.strip_energies import _compare, _compare_unknown, take_energies
+from wavebatch.surveying.matching.strip_energies import _compare, _compare_unknown, _find_gains, take_energies
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -189,6 +189,15 @@ def test_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tmp_pa
     done = call("calibrate", tmp_path / "s.las", "--targets", flickering / "t.csv", "-o", tmp_path / "c.toml")
     assert "light alternates" in done.stderr
     assert load_calibration(tmp_path / "c.toml").channels[0].relative_error > 0.9 * (1 / weak - 1)
+
+
+def test_a_pulse_without_a_time_hides_no_lasers_that_take_turns(rng):
+    """One time of 8,000 that was no number did, since it was the number of the last pulse."""
+    number = np.arange(8000)
+    light = np.where(number // 150 % 2, 0.7, 1.0) * np.exp(rng.normal(5.0, 0.1, len(number)))
+    pulses = np.stack([number * 1e-5, light, *np.ones((3, 8000)), 0.1 * (number % 400), 0.1 * (number // 400)])
+    pulses[0, -1] = np.nan
+    assert _find_gains(pulses)[1:] == (pytest.approx(-np.log(0.7), rel=0.1), pytest.approx(300, rel=0.01))
 
 
 @pytest.mark.slow

@@ -503,8 +503,8 @@ def find_warnings(
         if not lines and report.strayed_returns and "foreign-packets" not in prepared.scan.doubts.values():
             lines = [
                 f"about {report.strayed_returns} returns, in stretches of the strip, lie where their packets have no "
-                "echo, the others do: their return locations or packets are wrong, or they are means of two surfaces; "
-                "echoes there may be off by more than range_err"
+                "echo, the others do: their return locations or packets are wrong, or they are means of two surfaces, "
+                "or stand in the file twice; echoes there may be off by more than range_err"
             ]
         found += warn("foreign-packets", lines)
     found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()

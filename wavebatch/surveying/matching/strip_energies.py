@@ -209,7 +209,7 @@ def _find_gains(pulses: np.ndarray) -> tuple[float, float, int]:
     with np.errstate(invalid="ignore", divide="ignore"):
         found, turns, light = 0.0, (0.0, 0), pulses[1] / pulses[2]
     for channel in np.unique(pulses[3]):
-        own = (pulses[3] == channel) & (light > 0.0) & np.isfinite(light + pulses[5] + pulses[6])
+        own = (pulses[3] == channel) & (light > 0.0) & np.isfinite(light + pulses[[0, 5, 6]]).all(axis=0)
         seen, top, place = light[own], pulses[4, own] / pulses[2, own], pulses[5:, own]
         if len(seen) <= LEAST_COMPARED:
             continue
