@@ -34,8 +34,9 @@ def even_places(number: int, most: int) -> np.ndarray:
 
 def draw(seed: int, *shape: int) -> np.ndarray:
     """Numbers between 0 and 1 that look like chance, float64 of a shape: always the same for a seed."""
-    number = int(np.prod(shape))
-    return ((np.frombuffer(Random(seed).randbytes(4 * number), "<u4") + 0.5) / 2**32).reshape(shape)
+    source, size, most = Random(seed), 4 * int(np.prod(shape)), 1 << 24  # 2^28 bytes at once are an OverflowError
+    drawn = b"".join(source.randbytes(min(most, size - at)) for at in range(0, size, most))
+    return ((np.frombuffer(drawn, "<u4") + 0.5) / 2**32).reshape(shape)
 
 
 def distinct(values: np.ndarray) -> np.ndarray:
