@@ -78,6 +78,18 @@ def test_a_piece_has_the_keys_between_two_borders():
     assert first == last == list(range(64))
 
 
+def test_keys_that_come_again_and_again_are_summed_some_at_a_time(monkeypatch):
+    """A strip that is sorted by class has rows of all voxels in each batch: 420 MB more for each 500,000 pulses."""
+    plain, most = temp_store._sum, []
+    monkeypatch.setattr(temp_store, "_sum", lambda key, value: most.append(len(key)) or plain(key, value))
+    key, value = np.arange(300, dtype=np.uint64), np.ones((300, 3), np.int64)
+    with temp_store.KeyedSums(3, np.empty(0, np.uint64), in_memory=400) as sums:
+        for _ in range(100):
+            sums.add(key, value)
+        ((_, total),) = sums.pieces()
+    assert (total == 100).all() and max(most) < 2000
+
+
 def test_without_a_place_sums_say_so(no_place):
     none = np.empty(0, np.uint64)
     with temp_store.KeyedSums(3, none, in_memory=10) as sums, pytest.raises(InputError, match="TMPDIR"):

@@ -331,13 +331,14 @@ ROWS_IN_MEMORY = 1 << 18
 class KeyedSums(Closing):
     """Sums of `columns` integers per key: `add` any number of times, then `pieces`, then `close`. A context manager.
 
-    borders: ascending keys, u8; all rows from one to the next are in memory at a time. in_memory: most rows there until
+    borders: ascending keys, u8; all sums from one to the next are in memory at a time. in_memory: most rows there until
     some go to a temporary file.
     """
 
     def __init__(self, columns: int, borders: np.ndarray, *, in_memory: int = ROWS_IN_MEMORY) -> None:
         dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
         self._borders, self._rows = borders, Spool(len(borders) + 1, dtype, memory=in_memory * dtype.itemsize)
+        self._most = in_memory
 
     def close(self) -> None:
         """Remove the temporary file."""
@@ -354,9 +355,18 @@ class KeyedSums(Closing):
     def pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield keys, ascending and each once, with their sums, those between two borders at a time."""
         for bucket in range(self._rows.buckets):
-            rows = self._rows.read(bucket)
-            if len(rows):
-                yield _sum(rows["key"], rows["value"])
+            parts: list[tuple[np.ndarray, ...]] = []
+            number, most = 0, self._most
+            # Batches of a strip that is not in the order of its pulses bring rows of all voxels, each of them again.
+            for rows in self._rows.pieces(bucket):
+                parts.append((rows["key"], rows["value"]))
+                number += len(rows)
+                if number > most:
+                    parts = [_sum(*map(np.concatenate, zip(*parts, strict=True)))]
+                    number = len(parts[0][0])
+                    most = max(self._most, 2 * number)
+            if parts:
+                yield _sum(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _sum(key: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
