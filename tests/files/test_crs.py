@@ -494,6 +494,17 @@ def test_compound_records_and_feet_are_compared(tmp_path, wkt, code, named):
     assert any("contradict" in line for line in find_facts(path, "auto", False).warnings) == named
 
 
+@pytest.mark.parametrize(("zones", "named"), [((32632, 32633), True), ((32632, 32632), False)])
+def test_a_record_after_the_points_is_compared_with_that_in_the_header(tmp_path, zones, named):
+    """laspy takes the one after the points, wavebatch that in the header; spelling is no contradiction."""
+    front, back = (build_utm(zone) for zone in zones)
+    evlrs = [(b"LASF_Projection", WKT_ID, back.replace(",", ", ").encode() + b"\0")]
+    _with_record(tmp_path / "s.las", (1, 4), 9, vlrs=[build_wkt(front)], evlrs=evlrs)
+    with StripReader(tmp_path / "s.las") as reader:
+        assert reader.facts.crs == front
+        assert any("records of the CRS contradict" in line for line in reader.facts.warnings) == named
+
+
 @pytest.mark.parametrize("code", [32600, 32661, 25827, 25839, 26924, 31468, 4326, 0])
 def test_other_codes_are_not_guessed(code):
     assert build_utm(code) is None

@@ -30,7 +30,7 @@ from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import Draft, list_packet_files, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads, undoing
 from wavebatch.files.las import header as las
-from wavebatch.files.las.crs import CrsUnits, build_utm, find_code, find_epsg, read_crs
+from wavebatch.files.las.crs import LONGEST_WKT, CrsUnits, build_utm, find_code, find_epsg, read_crs
 from wavebatch.files.las.read_points import CheckedHeader, open_points, read_checked_header
 from wavebatch.files.las.write_points import PointFile, waveform_head
 from wavebatch.kernels.packets import MOST_BYTES, decode_packets
@@ -102,6 +102,9 @@ def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:
     every = {codes[1] or 0, *map(int, re.findall(r'"EPSG"\s*,\s*"?(\d{4,5})\b', crs or ""))}
     zones = {wkt.partition("PROJECTION")[2].rpartition(",AUTHORITY")[0] for wkt in map(build_utm, every) if wkt}
     wkts = [vlr.payload for vlr in header.vlrs if las.is_projection(vlr) and vlr.record_id == las.WKT_ID]
+    # laspy and others take the WKT after the points where there are two.
+    wkts += [las.read_evlr(path, evlr) for evlr in las.find_evlrs(path, header)[0] if las.is_projection(evlr)
+             and evlr.record_id == las.WKT_ID and evlr.length <= LONGEST_WKT]  # fmt: skip
     words = ["".join(payload.split(b"\0")[0].decode("latin-1").split()) for payload in wkts]
     texts = {find_epsg(text) or text for text in words}
     # Survey feet are written with 7 digits too; international feet differ in the sixth.
