@@ -77,8 +77,8 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
     ReturnScatter
         The smallest of three scatters, each less the errors of the fits. Neighbours: single returns of clear echoes
         off the line between the returns before and after them; it holds the roughness of the ground. Pairs of returns
-        of a packet, against the fits. Locations of returns against the fits; it holds the phase. Coordinates that are
-        rounded to more than that count instead.
+        of a packet, against the fits; not less than RETURNS. Locations of returns against the fits; it holds the
+        phase. Coordinates that are rounded to more than that count instead.
     """
     parts = list(_sample(reader, scan, system))
     if not parts:
@@ -89,6 +89,10 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
     kinds = {"neighbours": neighbours, "pairs of returns": pairs, "locations": offsets}
     found = {name: _measure(residuals) for name, residuals in kinds.items()}
     known = {name: HALF_C * scatter for name, scatter in found.items() if scatter is not None}
+    # What two returns of a packet share, as the instant of its pulse, cancels in their difference.
+    if known.get("pairs of returns", RETURNS) < RETURNS:
+        del known["pairs of returns"]
+        known["assumed"] = RETURNS
     source = min(known, key=known.__getitem__, default="assumed")
     # What rounding takes off the coarsest coordinate: locations do not show it.
     points = reader.read_points(0, int(min(scan.borders[-1], ROUNDED)), scan)
