@@ -432,7 +432,8 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], selection: PointFilt
                 tally.add_pulses(buckets.read(bucket))
         if keys.untimed:
             tally.notes.append(
-                f"points without GPS time (0 or NaN): {keys.untimed}; their pulses are found by return numbers"
+                f"points without GPS time (0 or NaN): {keys.untimed}; their pulses are found by return numbers, and a "
+                "pulse of which only some points have a time counts more than once"
             )
         tally.left_out = reader.left_out
     return tally
