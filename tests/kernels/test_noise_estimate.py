@@ -284,3 +284,14 @@ def test_weak_echoes_of_a_wide_pulse_are_no_slow_noise(spread):
     gain = 1 + 2 * np.sum(pooled.correlation * np.exp(-0.25 * (lags / width) ** 2))
     assert pooled.std * np.sqrt(gain) == pytest.approx(std, rel=0.08)
     assert pooled.level == pytest.approx(200, abs=0.1 * std + 0.1 * spread)
+
+
+def test_levels_of_known_noise_have_no_tails_in_them():
+    """By levels of one round, white noise that was known had correlations of .014 beside the late part of a pulse."""
+    rng = np.random.default_rng(1)
+    lag = np.arange(120)[:, None] - rng.uniform(36, 50, 2000)
+    pulse = np.exp(-0.5 * (lag / 3.1) ** 2) + 0.0046 * np.exp(-0.5 * ((lag - 39.6) / 9.9) ** 2)
+    height = 900 * np.exp(0.5 * rng.standard_normal(2000))
+    signal = np.rint(200 + rng.standard_normal(lag.shape) + height * pulse).astype(np.float32)
+    found = estimate_noise(signal, 11, begin=np.array([1.04**2]))
+    assert found.std == pytest.approx(1.04, rel=0.005) and found.correlation[:8].sum() < 0.03

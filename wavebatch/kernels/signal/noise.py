@@ -36,6 +36,10 @@ ROUNDS, SETTLED = 6, 0.01
 the change of the noise, as a share of it, below which it stays. Where weak echoes follow the last signal the first
 limits are too high for them."""
 
+LEVEL_ROUNDS = 2
+"""Of these, the ones that only need levels where the noise is known: levels of the first have tails of echoes in them,
+since the quiet edges that it begins from are wrong by some noise."""
+
 DRIFT = 1.0
 """Spread of the baselines, over the noise, from which each waveform's level is found from itself."""
 
@@ -139,7 +143,7 @@ def estimate_noise(
     recovery : int, samples
         Until the level is back after strong signal, where it is known; else it is measured.
     begin : float64 (k,), optional
-        Covariance of quiet samples 0, 1, 2, ... apart, as fewer waveforms show it: the first round only needs levels.
+        Covariance of quiet samples 0, 1, 2, ... apart, as fewer waveforms show it: LEVEL_ROUNDS only need levels.
 
     Returns
     -------
@@ -200,10 +204,10 @@ def _estimate_from(
             chance = np.maximum(_mean_variance(covariance, len(size)), QUANTISATION_STD**2 / size)
             total = accumulate(np.add, np.nan_to_num(above).astype(np.float64))
             end = np.minimum(np.arange(s) + reach - reach // 2, s)
-            begin = end - np.minimum(reach, end)
-            summed = total[end - 1] - np.where((begin > 0)[:, None], total[begin - 1], 0.0)
-            spread = chance[end - begin - 1][:, None] + chance[np.maximum(number, 1) - 1]
-            means = (summed / (end - begin)[:, None] / np.sqrt(spread)).astype(np.float32)
+            start = end - np.minimum(reach, end)
+            summed = total[end - 1] - np.where((start > 0)[:, None], total[start - 1], 0.0)
+            spread = chance[end - start - 1][:, None] + chance[np.maximum(number, 1) - 1]
+            means = (summed / (end - start)[:, None] / np.sqrt(spread)).astype(np.float32)
             means = np.where(np.isnan(above), above, means)
             # Only echoes make more of them so high than so low: noise is as often below its level, however slow it is.
             bound = np.float32(np.sqrt(2 * log(max(s / reach, 1.0) / BY_CHANCE)))  # Chernoff's
@@ -214,7 +218,7 @@ def _estimate_from(
         if np.isnan(level).any():
             above = signal - np.nan_to_num(level)
         mean, number = quiet_mean(above, quiet)
-        if begin is not None and not turn:
+        if begin is not None and turn < LEVEL_ROUNDS:
             level = np.where(number > 0, np.nan_to_num(level) + mean, np.float32(np.nan))
             continue
         # Waveforms whose quiet samples scatter like those of most others: the foot of an echo may be below a limit.
