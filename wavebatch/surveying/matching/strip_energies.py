@@ -56,9 +56,9 @@ and fewest periods that show it."""
 LEAST_COMPARED = 200
 """Pulses that show either."""
 
-PLACES, OF_PLACE, LEAST_PLACES, SMOOTH = 32, 128, 8, 3
+PLACES, OF_PLACE, LEAST_PLACES, SMOOTH = 32, 128, 8, 5
 """Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest; and
-degree of the curve that they follow."""
+places in the mean that stands for slow changes."""
 
 LEAST_SAID, STUCK = 0.01, 0.9
 """Smaller errors are not named; and the scatter of a log over that of the calibration's from which it does not stand
@@ -345,8 +345,10 @@ def _compare_drift(places: list[np.ndarray], shots: float) -> float:
     rest = light - slope * sent
     # A field's border in the middle of the strip looks like a drift: parts beside each other are of one field.
     error = weigh_alike(rest) * math.sqrt(float(rest @ rest) / (len(sent) - 2) / float(sent @ sent))
-    # Or in cells of the ground, by a smooth curve through the log: its medians have what the light of their shots has.
+    # Or in cells of the ground, by means of several places: medians have what the light of their shots has, and where a
+    # smooth curve leaves the steps of the log, light seems to follow it.
     number, rest, *place = np.concatenate(every, axis=1)
-    steady = np.polyval(np.polyfit(np.arange(len(sent)), sent, SMOOTH), number)
+    steady = np.convolve(np.pad(sent, SMOOTH // 2, mode="edge"), np.full(SMOOTH, 1 / SMOOTH), "valid")
+    steady = steady[number.astype(np.int64)]
     error, slope = min((error, slope), *find_growth_in_cells(steady, rest + steady, np.stack(place)))
     return slow * min(math.hypot(1.0 - slope, error), 1.0)
