@@ -106,7 +106,7 @@ def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:
     wkts += [las.read_evlr(path, evlr) for evlr in las.find_evlrs(path, header)[0] if las.is_projection(evlr)
              and evlr.record_id == las.WKT_ID and evlr.length <= LONGEST_WKT]  # fmt: skip
     words = ["".join(payload.split(b"\0")[0].decode("latin-1").split()) for payload in wkts]
-    texts = {find_epsg(text) or text for text in words}
+    texts = {find_epsg(text) or text for text in words if text}
     # Survey feet are written with 7 digits too; international feet differ in the sixth.
     sizes = {round(unit.horizontal, 7) for unit in units if unit.horizontal and np.isfinite(unit.horizontal)}
     if max(len(zones), len(texts), len(sizes)) > 1:
