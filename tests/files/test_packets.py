@@ -438,6 +438,21 @@ def test_witnesses_that_contradict_each_other_are_refused_unless_overridden(tmp_
     assert scan_of(path, direction="away").vectors.direction == "away"
 
 
+@pytest.mark.parametrize("units", [None, 7])
+def test_points_that_are_stored_twice_are_named(tmp_path, units):
+    """Their copies were written as returns without an echo, and no line said it."""
+    raw = make_raw()
+    path = raw.write(tmp_path / "a.las")
+    assert not any("stored twice" in line for line in scan_of(path).warnings)
+    rows = np.sort(np.r_[np.arange(len(raw.points)), np.arange(0, len(raw.points), 10)])
+    pairs = len(rows) - 40
+    raw.points = raw.points[rows]
+    with StripReader(raw.write(tmp_path / "b.las"), unit_points=units) as reader:
+        warnings = reader.scan().warnings
+    said = f"of {pairs} pairs of points with one packet that were looked at, {pairs - len(set(rows)) + 40} have one"
+    assert any(line.startswith(said) for line in warnings), warnings
+
+
 @pytest.mark.parametrize(("pairs", "problems"), [(2, 0), (3, 1)])
 def test_fewer_than_three_pairs_do_not_contradict_heights(pairs, problems):
     tally = DirectionTally("stored", pairs=[0, pairs], heights=[50, 0], ratios=[np.ones(50)])

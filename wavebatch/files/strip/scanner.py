@@ -284,6 +284,8 @@ LONGEST_RUN = 64
 MOST_OVERLAP = 4
 """Times that packets may claim the bytes of the waveform data: once is right, and damaged points claim some again. 1 MB
 of packets that begin a byte apart would be 1e9 samples. Returns far apart in the file claim their packet once each."""
+MANY_TWICE = 0.01
+"""Share of pairs with one place from which points are stored twice: coarse coordinates hide some short distances."""
 _PAIRS, _VOTERS = 4096, 256
 """Most pairs and points of a unit that vote on the direction of vectors."""
 MANY_UNITS = 256
@@ -311,6 +313,9 @@ class _Tally:
     long: int = 0
     stray: int = 0
     """Points far outside the bounds of the header."""
+    pairs: int = 0
+    twice: int = 0
+    """Pairs of points with one packet that were looked at, and those of one return."""
 
     def add(self, points: np.ndarray, start: int, judged: check.Judged, bounds: list[tuple[float, float]]) -> None:
         if any(least < low or most > high for (least, most), (low, high) in zip(judged.ends, bounds, strict=False)):
@@ -331,6 +336,8 @@ class _Tally:
         self.short += other.short
         self.long += other.long
         self.stray += other.stray
+        self.pairs += other.pairs
+        self.twice += other.twice
 
     def describe(self) -> dict[check.Reason, tuple[int, int]]:
         found = [reason for reason in check.Reason if reason in check.REASON_TEXTS and self.reasons[reason]]
@@ -344,6 +351,10 @@ class _Tally:
         if self.stray:
             where = f"{count(self.stray, 'point')} outside the bounds that the header claims, by more than their width"
             doubts[f"{where}: points or header are damaged, or axes are swapped; get the file again"] = "units"
+        if self.twice > MANY_TWICE * self.pairs:
+            where = f"of {count(self.pairs, 'pair')} of points with one packet that were looked at, {self.twice} have"
+            line = f"{where} one place, time and return number: points are stored twice, and numbers and densities of "
+            doubts[f"{line}points are too high; remove the copies"] = "packets"
         return doubts
 
 
@@ -579,6 +590,10 @@ class Scanner:
         first, second = near.take(groups.order[place - 1]), near.take(groups.order[place])
         xyz = np.stack([locate(records, self._facts.header) for records in (first, second)])
         self._found.votes.add_pairs(xyz, first, second)
+        same = (xyz[0] == xyz[1]).all(axis=1) & (first["gps_time"] == second["gps_time"])
+        same &= first["bit_fields"] == second["bit_fields"]
+        self._found.tally.pairs += len(same)
+        self._found.tally.twice += int(np.count_nonzero(same))
 
     def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
         """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context.
