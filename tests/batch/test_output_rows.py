@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections import defaultdict
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,10 +14,11 @@ import wavebatch as wb
 from wavebatch.batch.options import OPTIONS, RunOptions
 from wavebatch.batch.output_rows import UnitEchoes, _find_copies, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.unit import CHUNK_POINTS, Packing, prepare_strip
+from wavebatch.batch.unit import CHUNK_POINTS, Packing, pack_chunk, pack_rows, prepare_strip
 from wavebatch.core.echoes import COLUMNS, PASSED_THROUGH, Column, EchoFlag, EchoTable
 from wavebatch.core.errors import OF_FILES, StageError
-from wavebatch.files.las.header import split_numbers
+from wavebatch.files.disk.temp_store import spool_rows
+from wavebatch.files.las.header import build_dtype, split_numbers
 from wavebatch.files.strip.reader import PacketTable, StripReader
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
 from wavebatch.stages.chain import STAGES, load_profile
@@ -380,6 +382,9 @@ def test_copies_of_copies_and_echoes_of_other_pulses_decide_nothing():
     packets = PacketTable(np.ones(6, np.uint8), *(np.arange(6),) * 3, *whole, np.ones(6, bool))
     copied = _find_copies(SimpleNamespace(packets=packets, start=0), rays, np.array([0, 0, 0, 3, 3, 3]))
     assert copied.tolist() == [False, True, False, False, False, True]
+    packets.digitizer[1::3] = 2  # two receivers of a pulse: each echo of either counts
+    copied = _find_copies(SimpleNamespace(packets=packets, start=0), rays, np.array([0, 0, 0, 3, 3, 3]))
+    assert copied.tolist() == [False] * 5 + [True]
 
 
 def test_points_that_are_stored_twice_do_not_count_as_returns(edit_points, tmp_path):
@@ -430,6 +435,16 @@ def test_the_last_chunk_holds_the_rows_that_are_left_be_it_one():
     packing.next_chunk()
     assert not packing.has_chunk(last=False) and packing.has_chunk(last=True)
     assert [part[1:] for part in packing.next_chunk()] == [(CHUNK_POINTS, CHUNK_POINTS + 1)]
+
+
+def test_a_chunk_has_the_rows_of_a_unit_that_are_its_own():
+    rows = np.zeros(10, build_dtype(6, ()))
+    rows["X"] = np.arange(10)
+    rows = spool_rows(rows)
+    ((cut, _), (whole, _)) = (pack_chunk(Path("a.laz"), [(rows, *span)], 6) for span in ((3, 7), (0, 10)))
+    (right,) = pack_rows(Path("a.laz"), rows.read(0)[3:7], 6)
+    assert cut.data.tobytes() == right.data.tobytes()
+    assert (cut.points, whole.points) == (4, 10)
 
 
 MADE = sorted({name for stage in STAGES.values() if stage.kind == "attribute" for name in stage.makes} & COLUMNS.keys())

@@ -6,6 +6,7 @@ import pytest
 from wavebatch.core.order import (
     EvenSample,
     distinct,
+    draw,
     find_order,
     group_medians,
     known_median,
@@ -13,6 +14,17 @@ from wavebatch.core.order import (
     quantile,
     quantiles,
 )
+
+
+def test_drawn_numbers_look_like_chance_and_are_always_the_same():
+    drawn = np.stack([draw(seed, 2, 1000) for seed in range(20)])
+    assert drawn[0, 0, :2] == pytest.approx([0.84442185, 0.38524531], abs=1e-8)
+    np.testing.assert_array_equal(draw(7, 2000), drawn[7].ravel())
+    assert drawn.min() > 0 and drawn.max() < 1
+    number = np.bincount((10 * drawn.ravel()).astype(int))
+    assert np.abs(number - 4000).max() < 5 * 60  # standard deviations of a tenth of 40,000
+    together = np.corrcoef(drawn.reshape(40, 1000)) - np.eye(40)
+    assert np.abs(together).max() < 5 / np.sqrt(1000)
 
 
 def test_any_rows_get_the_order_of_a_full_sort(rng):

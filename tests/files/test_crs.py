@@ -126,6 +126,8 @@ def short(key, value):
         (keys(short(1024, 1)), b"", b"State plane, feet|", CrsUnits("projected", 0.3048)),
         (keys(short(1024, 1), short(3072, 2263)), b"", b"", CrsUnits("projected", US)),
         (keys(short(1024, 1), short(3072, 2222)), b"", b"", CrsUnits("projected", 0.3048)),
+        (keys(short(1024, 1), short(3072, 3492)), b"", b"", CrsUnits("projected", US)),
+        (keys(short(1024, 1), short(3072, 3491)), b"", b"", CrsUnits("projected")),
         (keys(short(1024, 1), short(3072, 25832), short(4096, 6360)), b"", b"", CrsUnits("projected", None, US)),
         (keys(short(1024, 1), short(3072, 2263), short(3076, 9001)), b"", b"", CrsUnits("projected", 1.0)),
         (keys(short(1024, 1), short(3072, 32767), short(4096, 32767)), b"", b"", CrsUnits("projected")),

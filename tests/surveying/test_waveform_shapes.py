@@ -560,6 +560,7 @@ def test_targets_too_weak_to_be_found_are_measured_beside_strong_echoes(height):
         signal[rows] += high[:, None] * bell((x - at[:, None]) / 2.0)
     system = survey_block(digitize(signal, 6)).system
     lags, variance = np.array(system.beside).T
+    assert lags.min() < -19 and lags.max() > 19
     late = (lags > 9) & (lags < 15)
     assert variance[~late & (lags < 5)].max() < 0.3
     assert variance[late].min() > 1.5 if height else variance[late].max() < 0.3
