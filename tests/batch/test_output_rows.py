@@ -387,6 +387,18 @@ def test_copies_of_copies_and_echoes_of_other_pulses_decide_nothing():
     assert copied.tolist() == [False] * 5 + [True]
 
 
+@pytest.mark.parametrize(("flags", "copied"), [((4, 0), (1, 0)), ((0, 4), (0, 1)), ((4, 4), (0, 0)), ((0, 0), (0, 0))])
+def test_an_echo_that_one_packet_cuts_is_that_of_another(flags, copied):
+    """Fitted at the end of its packet, it stayed beside the echo that the other packet shows whole, 2.5 widths away."""
+    table = EchoTable.build(np.arange(2), np.array([0.0, 5.0]), np.ones(2), np.full(2, 2.0), flags=np.uint16(flags),
+                            attributes={"point": np.array([-1, -1])})  # fmt: skip
+    rays = UnitEchoes(table, table.attributes["point"], np.ones(2, bool), np.tile([0.0, 0.0, -0.15], (2, 1)),
+                      np.zeros((2, 3)))  # fmt: skip
+    packets = PacketTable(np.ones(2, np.uint8), *(np.arange(2),) * 3, np.arange(2), *np.ones((2, 2), bool))
+    found = _find_copies(SimpleNamespace(packets=packets, start=0), rays, np.zeros(2, np.int64))
+    assert found.tolist() == list(map(bool, copied))
+
+
 def test_points_that_are_stored_twice_do_not_count_as_returns(edit_points, tmp_path):
     """Overlapping tiles that were merged: pulses of two returns had four."""
 

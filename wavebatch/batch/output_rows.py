@@ -344,11 +344,17 @@ def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarra
     return pulse
 
 
+CUT_REACH = 3.0
+"""Widths (standard deviations) from the top of a pulse to where it is below a hundredth of its height: an echo that a
+packet still shows has its top so far outside at most."""
+
+
 def _find_copies(unit: Unit, echoes: UnitEchoes, pulse: np.ndarray) -> np.ndarray:
     """Which echoes without a return another packet of their pulse and digitizer shows too, bool (k,).
 
     Packets of a pulse may overlap, and some files have one for each return: each of them shows the same echoes, of
-    which that of a return counts, or that of the first packet. No decomposer parts echoes within a pulse's width.
+    which that of a return counts, or that of the first packet. No decomposer parts echoes within a pulse's width. Where
+    a packet cuts an echo, another one shows it whole, CUT_REACH widths away at most.
     """
     table, packets = echoes.table, unit.packets
     copied, key = np.zeros(len(table), bool), np.full(len(packets), -1)
@@ -362,6 +368,9 @@ def _find_copies(unit: Unit, echoes: UnitEchoes, pulse: np.ndarray) -> np.ndarra
     head, shift = rows[first][group], np.full(len(packets), np.nan)
     shift[rows] = along_ray(echoes.origin[rows], echoes.origin[head], echoes.direction[head])
     time = table.time + shift[table.waveform]
+    left = table.attributes["point"] < 0
+    edge = (table.flags & EchoFlag.NEAR_EDGE) != 0
+    cut = left & edge
     at = np.flatnonzero(np.isfinite(time))
     at = at[np.lexsort((table.waveform[at], time[at], key[table.waveform[at]]))]
     pairs, behind = [np.empty((2, 0), np.int64)], 1
@@ -370,12 +379,15 @@ def _find_copies(unit: Unit, echoes: UnitEchoes, pulse: np.ndarray) -> np.ndarra
         near = key[table.waveform[one]] == key[table.waveform[other]]
         if not near.any():  # no pulse has so many; what others have decides nothing
             break
-        near &= time[other] - time[one] <= np.minimum(table.sigma[one], table.sigma[other])
+        reach = np.minimum(table.sigma[one], table.sigma[other])
+        for part, whole in ((one, other), (other, one)):
+            reach = np.where(cut[part] & ~edge[whole], CUT_REACH * table.sigma[whole], reach)
+        near &= time[other] - time[one] <= reach
         pairs.append(np.stack([one, other])[:, near & (table.waveform[one] != table.waveform[other])])
         behind += 1
     pair = np.concatenate(pairs, axis=1)
-    early, late = np.take_along_axis(pair, np.argsort(table.waveform[pair], axis=0), axis=0)
-    left = table.attributes["point"] < 0
+    rank = table.waveform[pair] + len(packets) * cut[pair]  # a cut echo counts last
+    early, late = np.take_along_axis(pair, np.argsort(rank, axis=0), axis=0)
     for copy, of in ((late, early), (early, late)):
         copied[copy[left[copy] & (table.attributes["point"][of] >= 0)]] = True
     left &= ~copied  # what is a copy itself shows nothing

@@ -353,8 +353,8 @@ class _Tally:
             doubts[f"{where}: points or header are damaged, or axes are swapped; get the file again"] = "units"
         if self.twice > MANY_TWICE * self.pairs:
             where = f"of {count(self.pairs, 'pair')} of points with one packet that were looked at, {self.twice} have"
-            line = f"{where} one place, time and return number: points are stored twice, and numbers and densities of "
-            doubts[f"{line}points are too high; remove the copies"] = "packets"
+            line = f"{where} one place, time and return number: points are stored twice, also in the cloud, so that "
+            doubts[f"{line}densities are too high; remove the copies"] = "packets"
         return doubts
 
 
