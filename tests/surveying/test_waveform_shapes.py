@@ -14,7 +14,7 @@ from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
-from wavebatch.surveying.measuring import learn_pulse
+from wavebatch.surveying.measuring import learn_pulse, misfit
 from wavebatch.surveying.measuring.joint_pulse import stack_jointly
 from wavebatch.surveying.measuring.judge import explain
 from wavebatch.surveying.measuring.learn_pulse import find_clear
@@ -564,6 +564,17 @@ def test_targets_too_weak_to_be_found_are_measured_beside_strong_echoes(height):
     late = (lags > 9) & (lags < 15)
     assert variance[~late & (lags < 5)].max() < 0.3
     assert variance[late].min() > 1.5 if height else variance[late].max() < 0.3
+
+
+@pytest.mark.parametrize(("samples", "turns"), [(100, 32), (8000, 17), (40_000, 8)])
+def test_echoes_are_added_to_so_many_samples_only(monkeypatch, samples, turns):
+    """Where no place is free; 600 long and full packets took 45 s and 470 MB."""
+    seen = []
+    monkeypatch.setattr(misfit, "_add_beside", lambda *given: seen.extend(given[-1]) or [])
+    block = WaveformBlock.from_samples(np.full((30, samples), 12, np.uint8))
+    echoes = EchoTable.build(np.arange(30), np.full(30, 50.0), np.full(30, 100.0), np.full(30, 2.0))
+    misfit.measure_beside(block, SystemPulse(2.0, noise=ReceiverNoise(12.0, std=1.0)), echoes)
+    assert seen == list(range(turns))
 
 
 def test_a_pulse_is_chosen_where_no_echo_stands_clear():

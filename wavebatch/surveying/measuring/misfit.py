@@ -42,9 +42,10 @@ TAIL_BEFORE, TAIL_AFTER = 15, 40
 BESIDE, NOT_ABSORBED = 10, 3
 """Widths of the pulse beside an echo up to which what is left is measured, and from which."""
 
-ADDED, MOST_TURNS = 512, 32
+ADDED, TURNS, MOST_ADDED = 512, (8, 32), 4 << 20
 """Echoes that are added and found, some 100 within two widths of each lag, and how often they are tried: in a canopy
-hardly a place is free. With 8 turns 54 to 65 % of NEON's waveforms were exact by the seed alone."""
+hardly a place is free. With 8 turns 54 to 65 % of NEON's waveforms were exact by the seed alone; more than these read
+this many samples at most, as 32 turns of packets that are long and full took half a minute."""
 
 HEIGHTS = 10.0, 40.0
 """Amplitudes over noise of echoes that are added: found beside strong ones too, small enough to be moved by them."""
@@ -560,11 +561,12 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     strong = strong.take(np.arange(0, len(strong), max(len(strong) // ADDED, 1)))
     if len(strong) < FEW:
         return system
+    most = int(np.clip(MOST_ADDED // (len(strong) * block.samples.shape[1]), *TURNS))
     lags, offs, turn, number = [np.empty(0)], [np.empty(0)], 0, 0
-    while turn < MOST_TURNS:
+    while turn < most:
         # As many turns together as are missing, if the next ones are like those before: a call takes as long as 50 do.
         missing = (2 * ADDED - number) / max(number / turn if turn else 2 * len(strong), 1)
-        turns = range(turn, min(turn + int(np.rint(missing if turn else max(missing, 1))), MOST_TURNS))
+        turns = range(turn, min(turn + int(np.rint(missing if turn else max(missing, 1))), most))
         if not turns:  # less than half of one
             break
         for lag, off in _add_beside(block, system, echoes, strong, turns):
