@@ -19,7 +19,7 @@ from plot_tools import write_cloud
 from strips import make_raw
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.schema import Above, declared_options
+from wavebatch.core.schema import Above, Range, declared_options
 from wavebatch.stages.chain import effective, load_profile
 from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import Calibration
@@ -549,6 +549,13 @@ def test_python_is_refused_what_the_command_line_is(kind):
         for value in wrong:
             with pytest.raises(ConfigError, match="^--[a-z-]+ [^:]+: (must lie (from|above) |choose |must be a whole)"):
                 kind(**{**OPTIONS[kind], name: value})
+
+
+def test_limits_with_and_without_their_least_value_differ():
+    """Python 3.11.2 gave the limits of one option to another: `voxelize` had a traceback with an unknown variable."""
+    low, above = Range(0.0, 1.0), Above(0.0, 1.0)
+    assert low != above and above != low and above == Above(0.0, 1.0) and len({low, above}) == 2
+    assert not (low == above or above == low or above != Above(0.0, 1.0))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX systems")

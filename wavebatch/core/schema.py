@@ -36,6 +36,15 @@ class Range(NamedTuple):
 class Above(Range):
     """A range without its least value."""
 
+    # Early versions of Python 3.11 keep one `Annotated[float, limits]` of equal limits, and tuples of one content are.
+    __hash__ = Range.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is Above and tuple.__eq__(self, other)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
     def hold(self, value: float) -> bool:
         """Whether a value lies in it; NaN does not."""
         return self.low < value <= self.high
