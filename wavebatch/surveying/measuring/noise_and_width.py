@@ -138,7 +138,7 @@ def measure_whole(block: WaveformBlock, begin: SystemPulse, *, cleaned: bool = F
     for _ in range(MOST_RETURNS):
         system, width = begin, begin.sigma_ref / block.spacing
         if more or cleaned:
-            noise = _find_noise(part, width, begin.noise)
+            noise = _find_noise(part, width, begin.noise, cleaned=cleaned)
             system = _gaussian_system(noise, block.spacing, width, begin.saturation)
         found = _isolated_width(block, system)
         if abs(found / width - 1) <= FAR_OFF:
@@ -216,13 +216,19 @@ def thin_samples(block: WaveformBlock, number: int) -> WaveformBlock:
     return thin_block(block, max(number // block.samples.shape[1], LEAST_LOOK))
 
 
-def _find_noise(block: WaveformBlock, width: float, begin: ReceiverNoise | None = None) -> PooledNoise:
-    """Noise outside of echoes of this width [samples]; begin: as fewer waveforms of the strip show it."""
+def _find_noise(
+    block: WaveformBlock, width: float, begin: ReceiverNoise | None = None, *, cleaned: bool = False
+) -> PooledNoise:
+    """Noise outside of echoes of this width [samples]; begin: as fewer waveforms of the strip show it.
+
+    cleaned: since then, so that it had defects in it, and only its recovery is still right.
+    """
     missing = None if block.missing is None else keep_longest(block.missing.T)
     reach, recovery, covariance = int(np.ceil(QUIET_FROM * width)), 0, None
     if begin is not None:
         recovery = round(begin.recovery / block.spacing)
-        covariance = begin.by_kind["quiet"] ** 2 * np.r_[1.0, begin.correlation] if begin.by_kind["quiet"] else None
+        if begin.by_kind["quiet"] and not cleaned:
+            covariance = begin.by_kind["quiet"] ** 2 * np.r_[1.0, begin.correlation]
     return estimate_noise(transpose_samples(block.samples), reach, missing=missing, recovery=recovery, begin=covariance)
 
 
