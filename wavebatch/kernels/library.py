@@ -116,7 +116,7 @@ class CStacked(ctypes.Structure):
         *_fields(_POINTER, "lag value weight"),
         *_fields(ctypes.c_double * 3, "low high"),
         *_fields(ctypes.c_double, "early onset last end damping most_damping settled"),
-        *_fields(ctypes.c_int64, "most every"),
+        ("most", ctypes.c_int64),
     ]
 
 

@@ -7,7 +7,7 @@ typedef struct {
     double low[3], high[3];                    /* bounds of weight, place and sigma of a component */
     double early, onset, last, end;            /* no centre before `early` or two sigmas less `onset`, but before `last`; end of the stack */
     double damping, most_damping, settled;
-    int64_t most, every;                       /* evaluations; lags that a fit sees: each `every`-th */
+    int64_t most;                              /* evaluations */
 } Stacked;
 
 static double earliest(const Stacked *s, double sigma) { return fmin(fmax(s->early, 2 * sigma - s->onset), s->last); }
@@ -87,22 +87,14 @@ static void step_stacked(const Stacked *s, double damping, const double *normal,
 }
 
 /* Fits each of some starts, (starts, 3 m): weight, delay and sigma of each component, in place. Returns the one that misses
-   all lags least, whatever their weights. */
-INLINE int64_t fit_stack_any(const Stacked *all, int64_t starts, double *found) {
-    Stacked few = *all, *s = &few;
-    s->n = (all->n + all->every - 1) / all->every;
-    const int64_t size = 3 * s->m, rows = s->m * all->n, stride = size + 4 * LANES;
-    double *memory = calloc(2 * rows + all->n + s->n * (3 + stride) + 2 * size * size + 3 * size + 1, sizeof(double)), least = INFINITY;
+   the lags least, whatever their weights. */
+INLINE int64_t fit_stack_any(const Stacked *s, int64_t starts, double *found) {
+    const int64_t size = 3 * s->m, rows = s->m * s->n, stride = size + 4 * LANES;
+    double *memory = calloc(2 * rows + s->n * (1 + stride) + 2 * size * size + 3 * size + 1, sizeof(double)), least = INFINITY;
     if (!memory) return -1;
-    double *z = memory, *bell = z + rows, *rest = bell + rows, *normal = rest + all->n, *matrix = normal + size * size;
-    double *downhill = matrix + size * size, *pivot = downhill + size, *there = pivot + size, *seen = there + size, *table = seen + 3 * s->n;
+    double *z = memory, *bell = z + rows, *rest = bell + rows, *normal = rest + s->n, *matrix = normal + size * size;
+    double *downhill = matrix + size * size, *pivot = downhill + size, *there = pivot + size, *table = there + size;
     int64_t best = 0;
-    for (int64_t i = 0, j = 0; i < s->n; i++, j += all->every) {
-        seen[i] = all->lag[j];
-        seen[s->n + i] = all->value[j];
-        seen[2 * s->n + i] = all->weight[j];
-    }
-    s->lag = seen, s->value = seen + s->n, s->weight = seen + 2 * s->n;
     for (int64_t start = 0; start < starts; start++) {
         double *at = found + start * size, missed = 0;
         for (int64_t a = 1; a < size; a += 3) at[a] = (at[a] - earliest(s, at[a + 1])) / (s->end - earliest(s, at[a + 1]));
@@ -125,15 +117,15 @@ INLINE int64_t fit_stack_any(const Stacked *all, int64_t starts, double *found) 
                 damping *= 4;
             }
         }
-        if (starts > 1) draw_stacked(all, at, z, bell, rest);
-        for (int64_t i = 0; i < all->n; i++) missed += rest[i] / all->weight[i] * (rest[i] / all->weight[i]);
+        if (starts > 1) draw_stacked(s, at, z, bell, rest);
+        for (int64_t i = 0; i < s->n; i++) missed += rest[i] / s->weight[i] * (rest[i] / s->weight[i]);
         if (missed < least) { least = missed; best = start; }
         for (int64_t c = 1; c < size; c += 3) at[c] = earliest(s, at[c + 1]) + at[c] * (s->end - earliest(s, at[c + 1]));
     }
     free(memory);
     return best;
 }
-OFFER(fit_stack, (const Stacked *all, int64_t starts, double *found), (all, starts, found))
+OFFER(fit_stack, (const Stacked *s, int64_t starts, double *found), (s, starts, found))
 
 /* The main lobe of pulses is looked for within LOBE widths of the main component, in COARSE steps per width; HALVINGS
    steps then find its peak and edges, to 1e-7 of such a step. */

@@ -127,13 +127,11 @@ class PulseFit(NamedTuple):
         return drawn / drawn.max()
 
 
-def fit_gaussians(
-    stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0, every: int = 1
-) -> list[PulseFit]:
+def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0) -> list[PulseFit]:
     """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more.
 
     One that gains less is kept where the next one after it makes up for both. Where one Gaussian reaches the goal, a
-    misfit in amplitudes, no more are fitted. Starts are compared by fits to each `every`-th lag.
+    misfit in amplitudes, no more are fitted.
     """
     weight = _weights(stack)
     parameters = np.array([1.0, 0.0, width])
@@ -164,7 +162,7 @@ def fit_gaussians(
         ]
         sharper = np.r_[parameters, -0.2, parameters[1], 1.3 * around]
         sharper[0] += 0.2
-        parameters = _refine(stack, weight, np.stack((*starts, sharper)), TRIAL_EVALUATIONS, every)
+        parameters = _refine(stack, weight, np.stack((*starts, sharper)), TRIAL_EVALUATIONS)
 
 
 def refine_gaussians(stack: Stack, components: np.ndarray) -> PulseFit:
@@ -210,14 +208,12 @@ def _sum(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     return np.einsum("bc,c->b", exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2), weight)
 
 
-def _refine(
-    stack: Stack, weight: np.ndarray, starts: np.ndarray, most: int = MOST_EVALUATIONS, every: int = 1
-) -> np.ndarray:
+def _refine(stack: Stack, weight: np.ndarray, starts: np.ndarray, most: int = MOST_EVALUATIONS) -> np.ndarray:
     """The sum of Gaussians that misses the stack least of those fitted from some starts (k, 3 c).
 
-    In at most `most` evaluations of each `every`-th lag. Parameters are weight, delay and sigma of each; fits move the
-    delay as a share of the way from the earliest that is allowed to a component of this sigma to the end of the stack.
-    Beyond the end nothing holds a component.
+    In at most `most` evaluations. Parameters are weight, delay and sigma of each; fits move the delay as a share of the
+    way from the earliest that is allowed to a component of this sigma to the end of the stack. Beyond the end nothing
+    holds a component.
     """
     found = np.array(starts, np.float64, ndmin=2)
     width, end = abs(found[0, 2]), stack.lag[-1]
@@ -225,7 +221,7 @@ def _refine(
     structure = CStacked(
         len(weight), found.shape[1] // 3, *(place(column, np.float64) for column in columns),
         (-DEEPEST, 0.0, 0.35 * width), (2.0, 1.0, 12.0 * width), -EARLIEST * width, ONSET * width, end - width, end,
-        FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED, most, every,
+        FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED, most,
     )  # fmt: skip
     return found[call("fit_stack", structure, ctypes.c_int64(len(found)), found)]
 

@@ -38,9 +38,6 @@ STEP, TAIL_STEP = 0.07, 5.0
 """Steps of the lag at which the core is drawn [widths], also where they are a tenth of a sample: echoes lie anywhere
 between samples, and coarser steps do not see what the Gaussians miss. And those in the tail over them."""
 
-COMPARED = 3
-"""Steps of the lag from one at which starts of a fit are compared to the next: no sigma is below five of them."""
-
 LEAST_CHANGE = 0.003
 """Least misfit that is expected of the strongest echoes, so that a few do not decide alone."""
 
@@ -92,7 +89,7 @@ def learn_jointly(
     if len(system.components) > 1 and not last:
         fits = [refine_gaussians(stack, np.array(system.components) / [1, spacing, spacing])]
     else:
-        fits = fit_gaussians(stack, width, MOST_COMPONENTS if last else 3, every=COMPARED)
+        fits = fit_gaussians(stack, width, MOST_COMPONENTS if last else 3)
     missed = [float(np.mean((fit.draw(stack.lag) - stack.value) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
