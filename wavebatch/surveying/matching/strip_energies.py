@@ -350,5 +350,5 @@ def _compare_drift(places: list[np.ndarray], shots: float) -> float:
     number, rest, *place = np.concatenate(every, axis=1)
     steady = np.convolve(np.pad(sent, SMOOTH // 2, mode="edge"), np.full(SMOOTH, 1 / SMOOTH), "valid")
     steady = steady[number.astype(np.int64)]
-    error, slope = min((error, slope), *find_growth_in_cells(steady, rest + steady, np.stack(place)))
+    error, slope = min([(error, slope), *find_growth_in_cells(steady, rest + steady, np.stack(place))])
     return slow * min(math.hypot(1.0 - slope, error), 1.0)
