@@ -401,6 +401,8 @@ def _columns(
     """The layout's columns and those needed of the echoes at `echo`; no-data where that is -1."""
     values = {**table.attributes, "echo_time": table.time}
     names = dict.fromkeys([*(written.column for written in layout.written), *needed])
+    # Without any waveform a table has no attributes, but conditions ask for them.
+    values |= {name: np.empty(0, COLUMNS[name].dtype) for name in needed if name not in values}
     return {name: spread(name, values[name], echo) for name in names if name in values}
 
 
