@@ -41,13 +41,12 @@ def test_a_canopy_is_no_noise_and_no_pulse(surveys):
 def test_echoes_of_a_canopy_are_found_with_the_survey_of_any_tile(surveys):
     """Of 2.8 that the true pulse and noise show; before, 2.5 were found, other ones by every tile's misfit.
 
-    What echoes must exceed beside strong ones is measured by a thousand that are added: by other random numbers 4 to 8
-    % of the packets differ.
+    Half as many echoes that are added beside strong ones made 8 % of them other ones.
     """
     block, found = surveys
     counts = [choose_chain(one).run(block, one.system).count(len(block)) for one in found]
-    assert min(number.mean() for number in counts) > 2.64
-    assert np.mean(counts[0] != counts[1]) < 0.1
+    assert min(number.mean() for number in counts) > 2.65
+    assert np.mean(counts[0] != counts[1]) < 0.05
 
 
 @pytest.mark.quick_cases("1")
@@ -349,6 +348,13 @@ def test_a_width_that_its_own_echoes_contradict_is_no_pulse(number, missed, tmp_
     result = judge_strip(number, tmp_path)
     assert result["right"] and result["missed"] < missed and not result["doubts"]
     assert result["width_ratio"] == pytest.approx(1, abs=0.08)
+
+
+def test_noise_that_is_smooth_widens_no_pulse_of_a_canopy(tmp_path):
+    """98 short packets: 56.5 ns of 53.1. One echo in 23 is missed since the noise is not too small any more: said."""
+    result = judge_strip(3138, tmp_path)
+    assert result["right"] and not result["extra"] and (result["doubts"] or result["missed"] < 0.01)
+    assert result["width_ratio"] == pytest.approx(1, abs=0.02)
 
 
 @pytest.mark.quick_cases("2465")

@@ -421,21 +421,23 @@ def two_recordings(seed, lost, n=600):
 
 def test_an_interpolated_seam_between_two_recordings_is_no_signal():
     """Echoes across it were 2 ns off (a hole of eight samples), or two: by the interpolated sample."""
-    block, time = two_recordings(14, (0.0, 0.0))
-    survey = survey_blocks([block])
-    assert survey.system.seams == {120: 60}
-    assert any("two recordings" in decision.reason for decision in survey.decisions)
-    across = np.abs(time - 60) < 3
-    numbers = []
-    for system in (survey.system, replace(survey.system, seams={})):
-        echoes = load_profile("accurate").run(block, system)
-        numbers.append(echoes.count(len(block))[across].mean())
-        if system.seams:
-            alone = echoes.take(np.flatnonzero(across[echoes.waveform] & echoes.alone(len(block))))
-            off = alone.time - time[alone.waveform]
-            assert np.quantile(np.abs(off), 0.9) < 0.1
-            assert 0.85 < np.std(off / alone.time_err) < 1.15
-    assert numbers[0] < 1.01 < 1.05 < numbers[1]
+    drawn = [two_recordings(seed, (0.0, 0.0)) for seed in (14, 15, 16)]
+    numbers = {"used": [], "not used": []}
+    for block, time in drawn:
+        survey = survey_blocks([block])
+        assert survey.system.seams == {120: 60}
+        assert any("two recordings" in decision.reason for decision in survey.decisions)
+        across = np.abs(time - 60) < 3
+        echoes = load_profile("accurate").run(block, survey.system)
+        numbers["used"].extend(echoes.count(len(block))[across])
+        alone = echoes.take(np.flatnonzero(across[echoes.waveform] & echoes.alone(len(block))))
+        off = alone.time - time[alone.waveform]
+        assert np.quantile(np.abs(off), 0.9) < 0.1
+        assert 0.85 < np.std(off / alone.time_err) < 1.15
+        without = load_profile("accurate").run(block, replace(survey.system, seams={}))
+        numbers["not used"].extend(without.count(len(block))[across])
+    # About 160 waveforms a draw, 4 to 9 % of them split where the seam is not used: one draw alone is luck.
+    assert np.mean(numbers["used"]) < 1.01 < 1.05 < np.mean(numbers["not used"])
     kept = parse_survey(format_survey(SavedSurvey(survey, "x", {})), "x")
     assert kept.survey.system.seams == {120: 60}
 
