@@ -41,14 +41,15 @@ def _wait_for_handlers(process):
         time.sleep(0.0005)
 
 
-@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.parametrize("jobs", ["1", "2", pytest.param("bench", marks=pytest.mark.slow)])
 def test_a_signal_at_any_instant_gives_130_and_leaves_nothing(strip, tmp_path, jobs):
-    """Other commands: `tests/test_attack.py`."""
+    """Of `run` and of `bench`. Other commands: `tests/test_attack.py`."""
     pairs = [(signal.SIGTERM, None), (signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)]
     for number, second in [*pairs, (signal.SIGXCPU, None), (signal.SIGXCPU, signal.SIGXCPU)]:
         folder = tmp_path / f"{number}{second}"
         folder.mkdir()
-        process = _start(["run", strip, "-o", folder, "--profile", "fast", "--jobs", jobs])
+        run = ["run", strip, "-o", folder, "--profile", "fast", "--jobs", jobs]
+        process = _start(["bench", "-o", folder, "--waveforms", "2000"] if jobs == "bench" else run)
         _wait_for_handlers(process)
         time.sleep(random.Random(jobs + folder.name).choice([0, 0.05, 0.2, 0.5, 1.0]))
         process.send_signal(number)
