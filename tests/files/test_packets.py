@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import random
 import re
 import shutil
 import struct
@@ -546,3 +547,27 @@ def test_points_may_say_anything_about_their_packets(tmp_path, damage):
         assert not unit.point_flags[sorted(set(range(40)) - touched)].any()
         seen = np.concatenate([np.empty(0, int), *(block.point for block, _ in reader.read_blocks(unit, 100, True))])
         assert len(seen) == len(set(seen.tolist())) == scan.packets
+
+
+@pytest.mark.parametrize(("point_format", "suffix"), [(4, ".las"), (10, ".laz"), (9, ".las")])
+def test_geometry_of_damaged_strips_is_finite(tmp_path, point_format, suffix):
+    """What the fuzzer does not see: rays and returns of every packet that is still read."""
+    rng = random.Random(point_format)
+    path = make_raw(30, point_format=point_format, internal=point_format != 9).write(tmp_path / f"a{suffix}")
+    whole, read = path.read_bytes(), 0
+    for _ in range(80):
+        data = bytearray(whole)
+        for _ in range(rng.choice([1, 2, 5, 20])):
+            at, width = rng.randrange(len(data)), rng.choice([1, 2, 4, 8])
+            data[at : at + width] = rng.choice([b"\xff" * width, bytes(width), rng.randbytes(width)])
+        path.write_bytes(data)
+        try:
+            with StripReader(path) as reader, reader.scan() as scan:
+                for number in range(reader.unit_count()):
+                    for block, _ in reader.read_blocks(reader.read_unit(number, scan), 64, True):
+                        read += len(block)
+                        for values in (block.origin, block.direction, block.returns.time):
+                            assert np.isfinite(values).all()
+        except InputError as error:
+            assert "\n" not in str(error)
+    assert read > 300
