@@ -350,7 +350,13 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
         raise InputError(
             f"{path}: coordinates look like degrees, since all points lie within one unit, and no CRS says so: {remedy}"
         )
-    scale = measure_scale(reader, scan).scale
+    scale, *_, level = measure_scale(reader, scan)
+    if level:
+        raise InputError(
+            f"{path}: most points of the ground (class 2) have the height 0: heights count from the ground, so slopes "
+            "and ranges would be wrong: take the strip with its heights before they were normalised, or leave out the "
+            "stages that need slopes or ranges"
+        )
     if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
         raise InputError(
             f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
@@ -404,7 +410,7 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
             f"{path}: coordinates are degrees, packet vectors metres, so new echoes would be misplaced: project the "
             "strip with its vectors to metres, or write only its own points with --points returns"
         )
-    scale, bent, pairs = measure_scale(reader, scan)
+    scale, bent, pairs, _ = measure_scale(reader, scan)
     bends: tuple[str, ...] = ()
     if bent > MOST_BENT:
         bends = (

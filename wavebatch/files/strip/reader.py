@@ -23,7 +23,7 @@ from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
 from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
-from wavebatch.files.las.header import locate, read_scanner, split_numbers
+from wavebatch.files.las.header import locate, read_classes, read_scanner, split_numbers
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check, scanner
 from wavebatch.files.strip.packets import BLOCK_BYTES, PacketFile, StripFacts, find_facts
@@ -457,6 +457,9 @@ LEAST_PAIRS, SCALE_SPREAD, BENT = 20, 0.05, 0.1
 """Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles; and by
 how much, over their distance, returns of one pulse may be off its ray: their times may be rounded to samples."""
 
+GROUND = 2
+"""Class of points of the ground."""
+
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """What steps through a strip have over a whole number, the next smaller one: those that are whole see one sensor only
 where two take turns."""
@@ -550,11 +553,13 @@ class PairScale(NamedTuple):
     bent: float = 0.0
     """Share of the pairs whose second return lies off the ray of the first by BENT of their distance, and more."""
     pairs: int = 0
+    level: bool = False
+    """Whether heights count from the ground: most of its points, of which there are LEAST_PAIRS, have the height 0."""
 
 
 def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
-    """Compare returns of one pulse at up to SCALE_PLACES places of the strip; nothing with fewer than LEAST_PAIRS."""
-    ratios, bends = [np.empty(0)], [np.empty(0)]
+    """Compare returns of one pulse, and heights of the ground, at up to SCALE_PLACES places of the strip."""
+    ratios, bends, heights = [np.empty(0)], [np.empty(0)], [np.empty(0)]
     units = _choose_units(scan)
     units, each = units[:: max(1, -(-len(units) // SCALE_PLACES))], max(SCALE_PLACES // max(len(units), 1), 1)
     places = [(first, stop) for begin, stop in units
@@ -562,6 +567,7 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
     for start, stop in places:
         points = reader.read_points(start, min(start + SLICE_POINTS, stop), scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
+        heights.append(xyz[read_classes(points) == GROUND, 2])
         with np.errstate(all="ignore"):
             vectors = packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
             place = np.diff(widen_integers(points["return_point_wave_location"]))
@@ -573,12 +579,14 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
             good = same & (points["wavepacket_index"][1:] > 0) & (by_time > _LEAST_PAIR) & np.isfinite(apart)
             ratios.append((apart / by_time)[good])
             bends.append((off / by_time)[good])
-    ratio = np.concatenate(ratios)
+    ratio, height = np.concatenate(ratios), np.concatenate(heights)
+    zero = np.count_nonzero(np.abs(height) < 0.5 * abs(reader.facts.header.scales[2]))
+    level = bool(len(height) >= LEAST_PAIRS and 2 * zero > len(height))
     if len(ratio) < LEAST_PAIRS:
-        return PairScale()
+        return PairScale(level=level)
     low, middle, high = (quantile(ratio, share) for share in (0.25, 0.5, 0.75))
     bent = float(np.mean(np.concatenate(bends) > BENT))
-    return PairScale(middle if high - low < SCALE_SPREAD * middle else None, bent, len(ratio))
+    return PairScale(middle if high - low < SCALE_SPREAD * middle else None, bent, len(ratio), level)
 
 
 def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
