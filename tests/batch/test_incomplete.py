@@ -137,7 +137,7 @@ def test_reports_merge_in_any_order():
 
 
 def test_a_report_reads_back_from_its_json():
-    report = _report() + RunReport(above_one=1, last_left_out=2, strayed_returns=256, copied_echoes=3)
+    report = _report() + RunReport(above_one=1, last_left_out=2, strayed_returns=256, unseen_returns=7, copied_echoes=3)
     again = RunReport.from_json(json.loads(json.dumps(report.to_json())))
     assert again.to_json() == report.to_json() != _report().to_json()
     assert (again + report).to_json() == (report + report).to_json()
@@ -254,3 +254,16 @@ def test_a_report_that_was_altered_is_made_anew(done, alter, is_right):
 def test_a_report_that_is_no_report_is_made_anew(done, data):
     (done / "out" / "a.report.json").write_bytes(data)
     assert run_one(done / "a.las", done / "out", batch={"resume": True}).status == "written"
+
+
+@pytest.mark.parametrize(
+    ("scene", "samples", "points"), [("flat", 10, "echoes"), ("flat", 10, "returns"), ("empty", 80, "echoes")]
+)
+def test_returns_without_an_echo_are_named_where_they_have_an_intensity(tmp_path, scene, samples, points):
+    """Echoes that fill their packets were taken for noise: four of five were lost in silence."""
+    simulate = "simulate", scene, "-o", tmp_path / "s.las", "--samples", str(samples), "--pulses", "1000", "-q"
+    assert run_command(*simulate).exit_code == 0
+    done = run_command("run", tmp_path / "s.las", "-o", tmp_path / "out", "--points", points, "--quiet")
+    unseen = read(tmp_path / "out")["quality"]["unseen_returns"]
+    assert (unseen > 500) == (scene == "flat")
+    assert (f"{unseen} of 992 returns with an intensity have packets" in done.stderr) == (scene == "flat")

@@ -101,6 +101,8 @@ class RunReport:
     """Points of left_out["where"] that are the last echo of their pulse."""
     strayed_returns: int = 0
     """Returns in stretches where too few match an echo of their packet."""
+    unseen_returns: int = 0
+    """Returns with an intensity whose packet holds no echo at all."""
     copied_echoes: int = 0
     """Echoes that do not count, because another packet of their pulse has them too."""
     remarks: tuple[str, ...] = ()
@@ -204,6 +206,7 @@ class RunReport:
                 "last_echoes_left_out": self.last_left_out,
                 "copied_echoes": self.copied_echoes,
                 "strayed_returns": self.strayed_returns,
+                "unseen_returns": self.unseen_returns,
                 **histograms,
             },
         }
@@ -232,6 +235,7 @@ class RunReport:
             last_left_out=int(quality.get("last_echoes_left_out", 0)),
             copied_echoes=int(quality.get("copied_echoes", 0)),
             strayed_returns=int(quality.get("strayed_returns", 0)),
+            unseen_returns=int(quality.get("unseen_returns", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=histograms["amplitude_dn"],
             echo_width=histograms["echo_width_ns"],

@@ -245,7 +245,7 @@ def assemble_echoes(
         matched=(echo < 0) | np.append(point >= 0, False)[echo],
         time=np.append(table.time, np.nan)[echo],
     )
-    report = _count(unit, table, counted, members.packet, found, owned[members.packet], reason)
+    report = _count(unit, table, counted, members.source, members.packet, found, owned[members.packet], reason)
     return Assembled(output, echo, columns, counted, replace(report, copied_echoes=len(table) - len(written)))
 
 
@@ -293,7 +293,8 @@ def assemble_returns(
     counted = unit.packets.owned[table.waveform] & (table.attributes["point"] < 0)
     copied = counted & _find_copies(unit, echoes, _find_pulses(unit, echoes, layout.source.header))
     counted[copied], counted[mine] = False, True
-    report = _count(unit, table, counted, packet, found, packet >= 0, np.where(found, np.uint16(0), reason))
+    rest = np.where(found, np.uint16(0), reason)
+    report = _count(unit, table, counted, unit.points, packet, found, packet >= 0, rest)
     report = replace(report, copied_echoes=int(copied.sum()))
     return Assembled(output, echo, columns, counted, report)
 
@@ -422,6 +423,7 @@ def _count(
     unit: Unit,
     table: EchoTable,
     counted: np.ndarray,
+    source: np.ndarray,
     packet: np.ndarray,
     found: np.ndarray,
     inside: np.ndarray,
@@ -430,8 +432,8 @@ def _count(
     """The report of a unit, without what is written of it.
 
     counted: echoes of the table (k,) that count in this unit.
-    packet, found, inside: of the points (k,) that are counted as returns: row of unit.packets, whether an echo matches,
-    whether it is counted. reason: of the output rows (m,).
+    source, packet, found, inside: of the points (k,) that are counted as returns: records, row of unit.packets, whether
+    an echo matches, whether it is counted. reason: of the output rows (m,).
     """
     owned = unit.packets.owned
     per_packet = np.append(table.count(len(owned)), 0)
@@ -458,5 +460,6 @@ def _count(
         no_data=count_reasons(table.attributes),
         above_one=int(np.count_nonzero(above)),
         strayed_returns=STRETCH * int(np.count_nonzero(parts < STRAYED)),
+        unseen_returns=int(np.count_nonzero(source["intensity"][inside & ~has_echoes])),
     )
     return report + RunReport.of_echoes(per_packet[:-1][owned], table.amplitude, table.sigma)

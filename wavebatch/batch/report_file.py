@@ -31,7 +31,7 @@ from wavebatch.stages.chain import effective
 from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
-from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets, name_gains
+from wavebatch.surveying.inspect_strip import LEAST_MATCHED, doubt_files, doubt_packets, name_gains
 from wavebatch.surveying.sensor import plain
 from wavebatch.surveying.systems.known_systems import doubt_survey
 from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey
@@ -507,6 +507,16 @@ def find_warnings(
                 "or stand in the file twice; echoes there may be off by more than range_err"
             ]
         found += warn("foreign-packets", lines)
+    # A vendor gives no intensity to a pulse without an echo.
+    unseen = report.unseen_returns
+    seen = unseen + report.count("matched_returns") + report.count("unmatched_returns")
+    if echoes and seen >= LEAST_JUDGED and unseen > (1.0 - LEAST_MATCHED) * seen:
+        line = (
+            f"{unseen} of {seen} returns with an intensity have packets without an echo: the noise of "
+            f"{prepared.system.noise.std:.3g} DN is too high, where packets are too short to show it beside their "
+            "echoes, or the threshold of the chain is; give --system, a survey of a longer strip of this sensor"
+        )
+        found += warn("noise-guess", [line])
     found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()
     # Flags of failed fits that far more echoes have than usual.
     written = report.count("points_out") - sum(report.passed_through.values())
