@@ -13,6 +13,7 @@ from plot_tools import PULSE, make_chain, simulate
 from scipy.optimize import curve_fit
 from strips import make_raw
 
+import wavebatch as wb
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import WaveformBlock
@@ -380,6 +381,18 @@ def test_a_listed_range_has_the_error_of_the_sensor_too(tiny_strip):
         views = waveform.read_views(reader, scan, places, chain, PULSE.with_radiometry(sensor_error=0.3), None, fill)
     places = [line.split("\N{PLUS-MINUS SIGN}")[-1].split()[0] for line in waveform.list_echoes(views).splitlines()[1:]]
     assert places and all(float(place) == pytest.approx(0.3, rel=0.1) for place in places)
+
+
+def test_a_table_has_the_values_and_errors_of_the_cloud(tmp_path, leica):
+    """The scatter of the vendor's returns was not in the errors of places: they were half of those of the run."""
+    succeed("plot", "waveform", leica, "--packet", "0:9", "-o", tmp_path / "e.csv")
+    succeed("run", leica, "-o", tmp_path, "--columns", "+echo_time,+range,+range_error", "--quiet")
+    names = "echo_time", "amplitude", "echo_width", "range_err", "range", "range_error"
+    cloud = np.stack([wb.read_cloud(tmp_path / f"{leica.stem}.laz")[name] for name in names], axis=1)
+    for row in csv.DictReader((tmp_path / "e.csv").read_text().splitlines()):
+        given = {name.split(" ")[0]: value for name, value in row.items()}
+        values = np.array([float(given[name]) for name in names])
+        assert (np.abs(cloud - values) <= 1e-5 * values).all(axis=1).any()
 
 
 SIGNALS = sorted({stage.searches[0] for stage in STAGES.values() if stage.searches and stage.searches[0]})

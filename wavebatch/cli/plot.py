@@ -378,8 +378,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     chain, request = find_request(shared.from_options(RunOptions, options))
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
     with opened as reader, reader.scan(force=options["force"]) as scan:
-        choice = prepare(reader, scan, chain, request, positions=Positions.NONE).choice
-        system = choice.survey.system
+        setup = prepare(reader, scan, chain, request, positions=Positions.NONE)
+        choice, system = setup.choice, setup.system  # which knows how exactly returns were placed, as that of a run
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
         run, fill = choice.chain, None
         if tabular or options["table"]:  # the distances of the echoes from the sensor, too, if its position is known
