@@ -32,7 +32,7 @@ from wavebatch.tools.simulate.strip import WKT, StripOptions
 from wavebatch.tools.voxels import rays
 from wavebatch.tools.voxels.grid import VoxelGrid
 from wavebatch.tools.voxels.rays import Ceiling, Deconvolution, Floor, _pulse_taps, deconvolve_block
-from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
+from wavebatch.tools.voxels.strip import VoxelOptions, _doubt_returns, voxelize_strip
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.4, std=1.05))
 SAVED = SavedSurvey(Survey(SYSTEM, 1000))
@@ -840,6 +840,16 @@ def test_returns_that_are_missing_or_stand_far_apart_are_named(strips, canopy, e
         summary, _ = voxelize_pulses(strip, tmp_path, how=QUICK, unit_points=unit_points)
         said = [line for line in summary.warnings if "in the file" in line]
         assert len(said) == bool(words) and all(words in line for line in said), (strip, unit_points)
+
+
+def test_last_returns_that_are_missing_are_named():
+    """Of a forest without the class of the ground, the lowest leaves were taken for the ground, without a line."""
+    shown = np.zeros((16, 16), int)
+    shown[1, 1], shown[2, 1:3], shown[3, 1:4] = 900, 80, 20
+    assert not list(_doubt_returns(shown, 1000, split=False))
+    shown[2, 2] = shown[3, 3] = 0
+    (line,) = _doubt_returns(shown, 1000, split=False)
+    assert "the last returns of 100 of 1000 pulses are not in the file" in line
 
 
 @pytest.mark.parametrize("apart", ["direction", "scanner", "place"])

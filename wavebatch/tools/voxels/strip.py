@@ -331,16 +331,23 @@ def _doubt_returns(shown: np.ndarray, found: int, split: bool) -> Iterator[str]:
     kinds = [shown[n, 1 : n + 1] for n in range(1, 16)]
     there, pulses = int(shown.sum()), sum(int(kind.max()) for kind in kinds)
     missing = sum(int(len(kind) * kind.max() - kind.sum()) for kind in kinds)
+    last = sum(int(kind.max() - kind[-1]) for kind in kinds)
     if split and missing > MOST_MISSING * (there + missing):
         yield (
             f"{missing} of {there + missing} returns that the points' numbers of returns count are not in the file: "
             "where returns of a pulse have packets of their own, the light of these is missing, and shares are wrong; "
             "take the whole strip"
         )
+    elif last > MOST_MISSING * pulses:
+        yield (
+            f"the last returns of {last} of {pulses} pulses are not in the file: what is left is taken for the ground, "
+            "so that heights and shares are wrong; take the whole strip"
+        )
     if found > (1.0 + MOST_MISSING) * pulses > 0:
         yield (
             f"{found} pulses are found where the points' return numbers count {pulses}: packets of a pulse stand far "
-            "apart in the file, and count as pulses of their own, so that shares are wrong; sort the strip by GPS time"
+            "apart in the file, and count as pulses of their own, or points were thinned out, which keeps more pulses "
+            "of many returns; shares are wrong: take the whole strip, sorted by GPS time"
         )
 
 
