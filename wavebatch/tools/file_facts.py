@@ -23,8 +23,6 @@ from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import describe_samples
 
-_MOST_SOURCES = 20
-
 
 def describe_file(path: Path, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
     """Return everything that `wavebatch info` shows of a file, as plain values.
@@ -194,7 +192,7 @@ def _describe_points(path: Path, header: las.LasHeader, is_ours: bool) -> dict[s
         "returns": {str(k): int(n) for k, n in enumerate(returns) if n},
         "numbers_of_returns": {str(k): int(n) for k, n in enumerate(totals) if n},
         "classes": {str(k): n for k, n in sorted(classes.items())},
-        "point_sources": {str(k): n for k, n in sorted(sources.most_common(_MOST_SOURCES))},
+        "point_sources": {str(k): n for k, n in sorted(sources.items())},
         **echoes,
     }
 
