@@ -66,6 +66,7 @@ def test_histogram_is_that_of_numpy(cloud, tmp_path):
     words = ("histogram", cloud, "-o", tmp_path / "h.png", "--overwrite", "--json", "-q", "--column")
     shown = json.loads(run(*words, "amplitude", "--bins", 37, "--range", "5:120").stdout)
     assert shown["series"] == [{"name": cloud.name, "values": counts.tolist()}]
+    assert shown["values"] == len(good) and shown["outside"] == len(good) - counts.sum() > 0
     assert np.allclose(shown["edges"], edges, rtol=1e-12)
     shown = json.loads(run(*words, "echo_flags").stdout)
     assert {"name": "SATURATED", "values": [int(np.count_nonzero(flags & EchoFlag.SATURATED))]} in shown["series"]

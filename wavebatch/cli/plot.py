@@ -126,7 +126,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
         flags = draw_cloud.count_points_by_flag(clouds, column, selection)
         draw_cloud.draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
         names, rows, edges = flags.names, flags.counts.reshape(-1, 1), ()
-        total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
+        total, outside, text = flags.total, 0, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
         how = {name: options[name] for name in ("bins", "limits", "each", "by")}
@@ -134,9 +134,10 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
         look = {name: options[name] for name in ("log", "counts", "overwrite")}
         draw_cloud.draw_cloud_histogram(found, output, **look)
         names, rows, edges = found.names, found.counts, found.edges.tolist()
-        total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
+        total, outside = found.total, int(found.below.sum() + found.above.sum())
+        text = describe_tally(total, outside)
     series = [{"name": name, "values": row} for name, row in zip(names, rows.tolist(), strict=True)]
-    return text, {"column": options["column"], **asdict(total), "edges": edges, "series": series}
+    return text, {"column": options["column"], **asdict(total), "outside": outside, "edges": edges, "series": series}
 
 
 @draws_clouds(
