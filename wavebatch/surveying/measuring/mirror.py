@@ -33,6 +33,9 @@ that of the waveform [full widths at half maximum]."""
 WORTH = 0.2
 """Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
 
+HAIR = 0.05
+"""Noises from a whole count up to which a sample of the mirror is one. In noise of less than a count few patterns of
+counts are near a threshold, and a level .01 counts from a half put 57 that were found just below it in the mirror."""
 
 LACK = 0.3
 """Share of the echoes within ZONE that a hole must be deeper than: neighbours that are not told apart leave less."""
@@ -79,7 +82,9 @@ def look_in_mirror(
         Of the echoes that have this energy, by the detector that is worse off.
     """
     echoes = explained.echoes
-    mirrored = replace(block, samples=(block.samples - 2 * explained.sums.left).astype(np.float32))
+    samples = (block.samples - 2 * explained.sums.left).astype(np.float32)
+    whole = np.rint(samples)
+    mirrored = replace(block, samples=np.where(np.abs(samples - whole) <= HAIR * system.noise.std, whole, samples))
     width = system.sigma_ref * FWHM_PER_SIGMA
     top = np.zeros(len(block), np.float32)
     np.maximum.at(top, echoes.waveform, echoes.amplitude)
