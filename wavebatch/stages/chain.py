@@ -369,7 +369,8 @@ class Chain:
         Returns
         -------
         EchoTable
-            Echoes sorted by waveform, then time, with the columns of the attribute stages.
+            Echoes sorted by waveform, then time, with the columns of the attribute stages. `range_err` is that of the
+            fit; how exactly a vendor placed the returns is in that of `wavebatch.run` only.
 
         Raises
         ------
