@@ -683,3 +683,28 @@ def test_heights_above_the_ground_are_refused_where_slopes_or_ranges_are_asked_f
     done = run_command("run", strip, "-o", tmp_path / "out", "--columns", f"+{shown}", "--profile", "fast")
     assert done.exit_code == code
     assert ("(class 2) have the height 0: heights count from the ground" in done.stderr) == (code > 0)
+
+
+@pytest.mark.parametrize("wrong", ["vectors", "unit", ""])
+def test_a_crs_in_metres_does_not_vouch_for_vectors_and_unit(tmp_path, edit_points, wrong):
+    """With one, as all LAS 1.4 strips have it, neither rays beside the returns nor feet were looked for."""
+    simulate = "simulate", "forest", "-o", tmp_path / "in.las", "--point-format", "9", "--pulses", "3000", "-q"
+    succeed(*simulate)
+
+    def change(points):
+        if wrong == "vectors":
+            points["z_t"] = np.sqrt(sum(points[name] ** 2 for name in ("x_t", "y_t", "z_t")))
+            points["x_t"] = points["y_t"] = 0.0
+        elif wrong == "unit":
+            for axis in "XYZ":
+                points[axis] = np.rint(points[axis] / 0.3048)
+
+    strip = edit_points(tmp_path / "in.las", tmp_path / "s.las", change)
+    done = run_command("run", strip, "-o", tmp_path / "out", "--quiet")
+    assert done.exit_code == (4 if wrong == "unit" else 0)
+    checked = run_command("check", strip)
+    voxels = run_command("voxelize", strip, "--size", "2", "-o", tmp_path / "v.npz", "--quiet")
+    assert checked.exit_code == bool(wrong) and voxels.exit_code == (wrong == "unit")
+    for said in (done.stderr, checked.stdout, voxels.stderr):
+        assert ("the second lies off its ray" in said) == (wrong == "vectors")
+        assert ("coordinates are in feet, packet vectors in metres" in said) == (wrong == "unit")

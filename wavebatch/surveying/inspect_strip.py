@@ -100,10 +100,13 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
         ):
             if scan.broken and not scan.with_waveform:
                 return Findings(str(path), scan.problems[:1], ())
+            from wavebatch.surveying.sensor import judge_scale  # as the survey in `_match_returns`, not for `info`
+
             facts = reader.facts
             problems = [*scan.problems, *scan.warnings, *facts.warnings]
             try:
                 describe_samples(reader, scan)
+                problems += judge_scale(reader, scan)
             except InputError as error:
                 problems.append(_without_name(path, error))
             else:

@@ -403,9 +403,7 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     path, units, ratio = reader.facts.path, reader.facts.units, scan.vectors.ratio
     along = next((unit.horizontal for unit in units if unit.horizontal is not None), None)
     is_feet = along is not None and abs(along / FOOT - 1.0) < 0.001
-    if along is not None and not is_feet and abs(ratio * FOOT - 1.0) >= 0.05:
-        return ()  # metres, and vectors of metres
-    if _look_like_degrees(reader) and ratio > 0.01:  # vectors in degrees are shorter than 1e-5
+    if (along is None or is_feet) and _look_like_degrees(reader) and ratio > 0.01:  # those in degrees are below 1e-5
         raise InputError(
             f"{path}: coordinates are degrees, packet vectors metres, so new echoes would be misplaced: project the "
             "strip with its vectors to metres, or write only its own points with --points returns"

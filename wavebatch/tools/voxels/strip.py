@@ -36,7 +36,7 @@ from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.inspect_strip import name_gains
 from wavebatch.surveying.prepare import Positions, prepare
-from wavebatch.surveying.sensor import SensorSource
+from wavebatch.surveying.sensor import SensorSource, judge_scale
 from wavebatch.surveying.systems.figures import describe_system
 from wavebatch.tools.voxels import grid as voxel_grid
 from wavebatch.tools.voxels import rays
@@ -203,6 +203,7 @@ def voxelize_strip(
                         calibration=calibration, energy=job.energy)  # fmt: skip
         source, pulse, energy = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.sent.energy
         doubts, section_error = (*setup.doubts, *(setup.sent.notes if calibration else ())), None
+        doubts += judge_scale(reader, scan)
         if calibration is not None:
             if pulse.radiometry.divergence is None:
                 raise ConfigError(
