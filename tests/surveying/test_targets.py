@@ -209,3 +209,23 @@ def test_the_error_of_an_outline_of_another_surface_is_over_the_constant_of_all_
     constant = np.where(depth < 0.5, 5.0, 1.0) / 3.0 * (1 + 0.01 * np.random.default_rng(1).standard_normal(200))
     edge, error = targets_module._compare_edge(constant, depth)
     assert edge == pytest.approx(4.0, rel=0.02) and error == pytest.approx(4.0 / 3.0, rel=0.02)
+
+
+@pytest.mark.parametrize(("middle", "found"), [(5.0, -0.8), (1.0, None)])
+def test_one_echo_of_another_surface_in_the_middle_of_an_outline_is_the_target(middle, found, rng):
+    """A target of 1.6 m that was declared as 12 m: the constant was 5.5 times too large, with an error of 3 %."""
+    depth = np.linspace(0.0, 1.0, 100)
+    constant = np.where(depth < 1.0, 1.0, middle) * (1 + 0.01 * rng.standard_normal(100))
+    edge, error = targets_module._compare_edge(constant, depth)
+    assert edge == (found if found is None else pytest.approx(found, abs=0.02))
+    assert error == pytest.approx(0.0 if found is None else 4.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("other", "apart"), [(2.0, 0.5), (1.0, 0.0)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_halves_of_a_small_target_are_compared(other, apart, axis, rng):
+    """An outline half on a field had twice the constant, with an error of 17 %: too few echoes for more parts."""
+    xyz = rng.uniform(-1, 1, (30, 3))
+    constant = np.where(xyz[:, axis] > 0.0, other, 1.0) * (1 + 0.02 * rng.standard_normal(30))
+    assert targets_module._compare_parts(constant, xyz) == pytest.approx(apart, abs=0.05)
+    assert targets_module._compare_parts(constant[:19], xyz[:19]) == 0.0

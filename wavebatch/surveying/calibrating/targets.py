@@ -357,10 +357,14 @@ def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:
 def _compare_parts(constant: np.ndarray, xyz: np.ndarray) -> float:
     """Scatter of the constants of parts of a target, beyond what the scatter within them explains."""
     side = min(int((len(constant) / LEAST_ECHOES) ** 0.5), MOST_PARTS)
-    if side < 2:
+    if len(constant) < 2 * LEAST_ECHOES:
         return 0.0
-    columns = np.array_split(np.argsort(xyz[:, 0], kind="stable"), side)
+    east, north = (np.argsort(xyz[:, axis], kind="stable") for axis in (0, 1))
+    columns = np.array_split(east, side)
     parts = [part for some in columns for part in np.array_split(some[np.argsort(xyz[some, 1], kind="stable")], side)]
+    if side < 2:  # halves, the way in which they differ more
+        ways = [np.array_split(order, 2) for order in (east, north)]
+        parts = max(ways, key=lambda both: float(np.var([np.median(constant[part]) for part in both])))
     chance = np.mean([MEDIAN_ERROR**2 * robust_std(constant[part]) ** 2 / len(part) for part in parts])
     return float(max(np.var([np.median(constant[part]) for part in parts]) - chance, 0.0) ** 0.5)
 
@@ -378,12 +382,13 @@ def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None
     off = middle[0] / middle[1] - 1.0
     if abs(off) >= max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
         return float(off), abs(middle[0] - middle[1])  # over the median of all, which is the constant
-    few = LEAST_ECHOES // 2
-    core = float(np.median(constant[np.argsort(depth)[-few:]]))
-    off = float(np.median(constant)) / core - 1.0
-    if abs(off) < max(LEAST_CORE, EDGE_SIGMA * max(spreads) * MEDIAN_ERROR / few**0.5):
-        return None, 0.0
-    return off, abs(off / (1.0 + off))
+    inwards = np.argsort(depth)
+    for few in (LEAST_ECHOES // 2, 1):  # a target much smaller than its outline has one echo
+        core = float(np.median(constant[inwards[-few:]]))
+        off = float(np.median(constant)) / core - 1.0
+        if abs(off) >= max(LEAST_CORE, EDGE_SIGMA * max(spreads) * MEDIAN_ERROR / few**0.5):
+            return off, abs(off / (1.0 + off))
+    return None, 0.0
 
 
 def combine_targets(
