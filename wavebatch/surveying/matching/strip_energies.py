@@ -48,10 +48,11 @@ SAME_TOP, SURFACES = 0.84, 0.6
 leave: one, since two are the same also where even ground is weak or clipped; and by how much surfaces of one strip
 differ in brightness: real and simulated ones by 0.1 to 0.9 (robust standard deviation of the logarithm)."""
 
-LEAST_APART, SURE_TURNS, CYCLES = 0.04, 6.0, 4
+LEAST_APART, SURE_TURNS, ALIKE_TURNS, CYCLES = 0.04, 6.0, 0.7, 4
 """Light takes turns where that of two lasers differs by more than the first (logarithm), and by so many errors in cells
 of either size: the strongest period counts, so that sound scenes reach 4, rows of plants 5.3, and 12 in one size;
-and fewest periods that show it."""
+by how much as in larger cells it does in smaller ones, where ground that swings gradually shows half; and fewest
+periods that show it."""
 
 LEAST_COMPARED = 200
 """Pulses that show either."""
@@ -239,8 +240,9 @@ def _find_gains(pulses: np.ndarray) -> tuple[float, float, int]:
         best = int(np.argmax(np.abs(lines[rows])))
         turn = np.sign(np.cos(2.0 * np.pi * number / periods[best] + np.angle(lines[rows[best]])) + 1e-9)
         shown = list(find_growth_in_cells(turn, bright, place))
-        if shown and all(slope > SURE_TURNS * error for error, slope in shown):
-            turns = max(turns, (2.0 * min(slope for _, slope in shown), int(periods[best])))
+        least, most = (choose((slope for _, slope in shown), default=0.0) for choose in (min, max))
+        if least > ALIKE_TURNS * most and all(slope > SURE_TURNS * error for error, slope in shown):
+            turns = max(turns, (2.0 * least, int(periods[best])))
     return found, *(turns if turns[0] > LEAST_APART else (0.0, 0))
 
 
