@@ -11,6 +11,7 @@ from batch_tools import make_job, read_cloud, run_one
 from commands import refuses, run_command
 
 import wavebatch as wb
+from wavebatch.batch import output_rows
 from wavebatch.batch.options import OPTIONS, RunOptions
 from wavebatch.batch.output_rows import UnitEchoes, _find_copies, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.run import run_batch
@@ -532,3 +533,16 @@ def test_a_flight_height_is_used_named_or_refused(tiny_strip, tmp_path):
         assert f"--flight-height {height} m contradicts the strip: by its direction vectors" in str(error)
     with pytest.raises(wb.ConfigError, match="--trajectory and --flight-height exclude each other"):
         wb.run(tiny_strip, tmp_path / "both", columns="+range", trajectory=tiny_strip, flight_height=800.0)
+
+
+def test_echoes_of_two_packets_of_a_pulse_share_it(monkeypatch):
+    """A packet for each return: of two pulses each, one apart, one with copies of an echo; and of another digitizer."""
+    monkeypatch.setattr(output_rows, "_find_pulses", lambda *_: np.array([0, 0, 2, 2, 4, 4]))
+    table = EchoTable.build(np.arange(6), np.array([0.0, 9.0, 0.0, 1.0, 0.0, 9.0]), np.ones(6), np.full(6, 2.0))
+    rays = UnitEchoes(table, table.waveform, np.ones(6, bool), np.tile([0.0, 0.0, -0.15], (6, 1)), np.zeros((6, 3)))
+    digitizer = np.array([1, 1, 1, 1, 1, 2], np.uint8)
+    packets = PacketTable(digitizer, *(np.arange(6),) * 3, np.arange(6), *np.ones((2, 6), bool))
+    unit = SimpleNamespace(packets=packets, start=0)
+    assert output_rows.find_shared(unit, rays, None).tolist() == [True, True, False, False, False, False]
+    packets.owned[1] = False
+    assert not output_rows.find_shared(unit, rays, None).any()

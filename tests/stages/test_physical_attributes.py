@@ -17,7 +17,7 @@ from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.kernels.physics.radiometry import receive_power
 from wavebatch.stages import pulse_tables
 from wavebatch.stages.attribute.basic import position
-from wavebatch.stages.attribute.radiometry import echo_light, hide_edges
+from wavebatch.stages.attribute.radiometry import echo_light, hide_values
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step, load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
 from wavebatch.surveying.flat_ground import SLOPE, predict_angles
@@ -494,7 +494,7 @@ def test_level_reflectances_at_edges_are_left_out_with_the_reason():
     table = EchoTable.build(np.arange(4), np.full(4, 5.0), np.full(4, 9.0), np.ones(4)).with_attributes(
         edge=np.array([True, False, True, True]), **columns
     )
-    found = hide_edges(table).attributes
+    found = hide_values(table, name, table.attributes["edge"], NoData.EDGE).attributes
     assert found[f"{name}_reason"].tolist() == [NoData.EDGE, 0, NoData.TOO_STEEP, NoData.EDGE]
     for key in (name, f"{name}_err"):
         assert np.isnan(found[key]).tolist() == [True, False, True, True] and found[key][1] == columns[key][1]

@@ -345,6 +345,28 @@ def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarra
     return pulse
 
 
+def find_shared(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarray:
+    """Find the echoes that share their pulse with echoes of another one of its packets: bool (k,).
+
+    Some files have a packet for each return, in which its echo seems to be alone.
+    """
+    table, packets, shared = echoes.table, unit.packets, np.zeros(len(echoes.table), bool)
+    rows = np.flatnonzero(packets.owned)
+    key = np.full(len(packets), -1)
+    pulse = _find_pulses(unit, echoes, header)[packets.owner[rows] - unit.start]
+    key[rows] = 256 * pulse + packets.digitizer[rows]
+    own = np.flatnonzero(key[table.waveform] >= 0)
+    packet = table.waveform[own]
+    first, group = np.unique(key[packet], return_index=True, return_inverse=True)[1:]
+    head = packet[first][group]
+    time = table.time[own] + along_ray(echoes.origin[packet], echoes.origin[head], echoes.direction[head])
+    early, late = np.full(len(first), np.inf), np.full(len(first), -np.inf)
+    np.minimum.at(early, group, time + table.sigma[own])
+    np.maximum.at(late, group, time - table.sigma[own])
+    shared[own] = (late > early)[group]
+    return shared
+
+
 CUT_REACH = 3.0
 """Widths (standard deviations) from the top of a pulse to where it is below a hundredth of its height: an echo that a
 packet still shows has its top so far outside at most."""

@@ -20,7 +20,15 @@ import numpy as np
 
 from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
 from wavebatch.batch.job import RowColumn, StripJob, UnitRows, plan_filter, plan_layout
-from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.output_rows import (
+    Assembled,
+    UnitEchoes,
+    assemble_echoes,
+    assemble_returns,
+    find_shared,
+    gather_echoes,
+)
+from wavebatch.core.echoes import NoData
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.frozen import frozen
 from wavebatch.core.process import Seconds
@@ -36,7 +44,7 @@ from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.kernels.geometry.normals import find_edges
-from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
+from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_values
 from wavebatch.stages.chain import Solved, Step
 from wavebatch.surveying import flat_ground
 from wavebatch.surveying.calibration import needs_sensor
@@ -53,6 +61,9 @@ BLOCK_SAMPLES = 1 << 22
 
 USUAL_SAMPLES = 256
 """Waveforms of more samples than this count several times where --block-size is given."""
+
+LEVEL = "level_reflectance"
+"""The column that is computed before edges are known."""
 
 STEEP = 80.0
 """Largest slope that the error of a level reflectance holds [deg]."""
@@ -344,7 +355,13 @@ def solve_unit(
     start = Seconds.now()
     solved = _mark_edges(prepared, solved)
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
-    layout, needed = prepared.layout, prepared.needed
+    layout, needed, angle = prepared.layout, prepared.needed, flat_ground.angle_parameters(prepared.job.chain)
+    first = unit.packets.owner[unit.packets.owned] - unit.start
+    # Packets of one time may be those of one pulse.
+    if angle is not None and angle["alone"] and (np.diff(unit.points["gps_time"][first]) <= 0.0).any():
+        shared = find_shared(unit, echoes, layout.source.header)
+        table = hide_values(echoes.table, "incidence_angle", shared, NoData.SHARED_PULSE)
+        echoes = replace(echoes, table=table)
     if echoes_mode:
         made = assemble_echoes(unit, echoes, layout, needed, prepared.job.selection.drop_flags)
     else:
@@ -376,7 +393,7 @@ def _mark_edges(prepared: Prepared, solved: SolvedBlocks) -> SolvedBlocks:
     edge[order] = find_edges(place, ray, time, before, after, INSET * beam * distance)
     ends = np.cumsum([len(block.echoes) for _, block in solved])
     return [
-        (index, block._replace(echoes=hide_edges(block.echoes.with_attributes(edge=part))))
+        (index, block._replace(echoes=hide_values(block.echoes.with_attributes(edge=part), LEVEL, part, NoData.EDGE)))
         for (index, block), part in zip(solved, np.split(edge, ends[:-1]), strict=True)
     ]
 

@@ -502,14 +502,13 @@ def level_reflectance(
     return _divide(block, echoes, "level_reflectance", light, angle, relative)
 
 
-def hide_edges(echoes: EchoTable) -> EchoTable:
-    """Leave out the level reflectance of echoes with the attribute `edge`: it is computed before edges are known."""
-    name, edge = "level_reflectance", echoes.attributes["edge"]
+def hide_values(echoes: EchoTable, name: str, where: np.ndarray, reason: NoData) -> EchoTable:
+    """Leave out the values of a column where that turns out to be no data only later, bool (m,)."""
     if name not in echoes.attributes:
         return echoes
-    hidden = edge & np.isfinite(echoes.attributes[name])
+    hidden = where & np.isfinite(echoes.attributes[name])
     changed = {key: np.where(hidden, np.float32(np.nan), echoes.attributes[key]) for key in (name, f"{name}_err")}
-    changed[f"{name}{SUFFIX}"] = np.where(hidden, np.uint8(NoData.EDGE), echoes.attributes[f"{name}{SUFFIX}"])
+    changed[f"{name}{SUFFIX}"] = np.where(hidden, np.uint8(reason), echoes.attributes[f"{name}{SUFFIX}"])
     return echoes.with_attributes(**changed)
 
 
