@@ -44,10 +44,10 @@ from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
+from wavebatch.surveying.calibration import ONE_VIEW, Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.matching import setting, strip_match
 from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, refuse_headings, weigh_alike
-from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
+from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading, judge_sides
 from wavebatch.tools.api import plan_run
 
 pytestmark = pytest.mark.kept_surveys
@@ -246,6 +246,8 @@ def test_even_light_is_assumed_where_no_place_is_seen_at_other_angles(tmp_path, 
 
 
 SENSOR = Sensor(**BASE, light=LIGHT)
+SIDES = 0.048
+"""Error by light across the swath, which the fields of this strip hide."""
 
 
 def test_the_term_over_the_scan_angle_is_not_known_beyond_the_edge_that_showed_it():
@@ -345,7 +347,7 @@ def test_noise_alone_over_ground_in_common_is_sunlight(tmp_path, calibrated):
     """The ground shows that light is the same: noise twice as large gave 62 % of error."""
     write_strip(tmp_path / "b.las", FARMLAND, replace(SENSOR, noise=1.2, time=START + 600), 6000, seed=4)
     assert "warning" not in run(calibrated, tmp_path / "out", tmp_path / "b.las")
-    assert state_error(tmp_path / "out" / "b.laz") < 0.06
+    assert state_error(tmp_path / "out" / "b.laz") < np.hypot(0.06, SIDES)
 
 
 @pytest.mark.quick_cases("0.8")
@@ -579,6 +581,40 @@ def test_a_wrong_pulse_zone_under_a_narrow_swath_is_refused_by_its_light(tmp_pat
         done = call("run", tmp_path / "b.las", "-o", tmp_path / f"out{code}", "--calibration", tmp_path / "cal.toml")
         assert done.exit_code == code, done.output
         assert ("as if all ranges were 600 m too short, 1 x the way between two pulses" in done.stderr) == bool(off)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ground", [FARMLAND, [Facet(0.3)]], ids=["fields", "even"])
+@pytest.mark.parametrize(
+    ("light", "way"),
+    [(lambda u: 0.9 + 0.1 * u, "from half to half"), (lambda u: 1 - 0.25 * u * u, "between its middle"), (None, "")],
+    ids=["side", "edges", "right"],
+)
+def test_light_that_is_uneven_across_the_swath_of_one_strip_is_in_the_error(tmp_path, ground, light, way):
+    """Edges were 10 % off, with 3 % of error in silence: .3 of the echoes were within it."""
+    even = ground is not FARMLAND
+    falls = None if light is None else lambda seconds: light(1 - 2 * (25 * seconds % 1))
+    write_strip(tmp_path / "a.las", ground, SENSOR, 12_000, seed=5, light=falls)
+    write_field(tmp_path / "t.csv")
+    calibrate(tmp_path, "--divergence", 0.5, strips=["a.las"])
+    said = run(tmp_path, tmp_path / "out", "a.las")
+    assert ("calibration: light falls " in said) == bool(even and light) and (way in said or not even)
+    cloud, stated = wb.read_cloud(tmp_path / "out" / "a.laz"), state_error(tmp_path / "out" / "a.laz")
+    off, inside = compare_fields(cloud, cloud["level_reflectance"])
+    off = cloud["level_reflectance"] / 0.3 - 1 if even else off[inside]
+    assert np.mean(np.abs(off) < stated) > (0.6 if even else 0.45)  # .28 and .36 of fields before
+    assert (stated < 0.04) == (even and light is None)
+
+
+@pytest.mark.parametrize(
+    ("told", "growth"), [({"conditions": ONE_VIEW}, 0.1), ({}, 0.0), ({"conditions": ONE_VIEW, "swath": (1.0,)}, 0.0)]
+)
+def test_strips_that_were_calibrated_together_show_the_light_across_their_swath(told, growth):
+    named, hidden = Change(-0.12, 0.9, 0.1), Change(0.0, 0.1, 0.05)
+    found, lines, notes = judge_sides(Calibration(1.0, 0.03, **told), [named, NO_CHANGE])
+    assert found == pytest.approx(growth, abs=0.01) and len(lines) == bool(growth) and not notes
+    assert len(judge_sides(Calibration(1.0, 0.03, **told), [NO_CHANGE, hidden])[2]) == 0
+    assert len(judge_sides(Calibration(1.0, 0.03, **told), [hidden, hidden])[2]) == bool(growth)
 
 
 def disc(radius):
@@ -905,7 +941,7 @@ def test_other_air_on_the_day_of_the_calibration_is_named_and_in_the_error(tmp_p
     line = run(calibrated, tmp_path, "a.las", "--attenuation", given, "--columns", columns)
     assert said in line and ("contradicts" in line) == bool(said)
     stated = state_error(tmp_path / "a.laz")
-    assert stated == pytest.approx(np.hypot(0.031, 4.6e-4 * 703 * (given - 0.22)), abs=0.004)
+    assert stated == pytest.approx(np.linalg.norm([0.031, SIDES, 4.6e-4 * 703 * (given - 0.22)]), abs=0.004)
     # No remark about reflectances and normals, which are not written.
     assert not [one for one in json.loads((tmp_path / "a.report.json").read_text())["remarks"] if "none of" in one]
 

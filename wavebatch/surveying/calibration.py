@@ -46,6 +46,9 @@ def check_attenuation(value: float) -> None:
     raise ConfigError(f"{problem} Clear air has 0.1 to 0.5 dB/km")
 
 
+ONE_VIEW = ", even light across the swath assumed"
+"""End of the conditions where each place was seen at one angle, as by one strip: overlaps did not show the light."""
+
 CHANGE_CHANCE = 0.3
 """Of another energy or gain under the same header, where no calibration says it."""
 

@@ -29,7 +29,7 @@ from wavebatch.surveying.calibrating import adjust_flight as adjust
 from wavebatch.surveying.calibrating.calibration_files import Target
 from wavebatch.surveying.calibrating.strip_echoes import CLEAN_ECHO, CalibrationOptions, open_source
 from wavebatch.surveying.calibrating.targets import MOST_ECHOES, build_calibration, describe_channel, measure_ranging
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, check_attenuation
+from wavebatch.surveying.calibration import ONE_VIEW, Calibration, ChannelConstant, StripConstant, check_attenuation
 from wavebatch.surveying.matching.setting import PLACES, SCANNERS, number_channel, refuse_headings, see_channels
 from wavebatch.surveying.matching.strip_energies import StripEnergies
 
@@ -39,10 +39,9 @@ MOST_TIES = 200_000
 MOST_OF_COLUMN = 20_000
 """Most waveforms of a strip that are decomposed for a column of reflectances, from whole squares as well."""
 
-ONE_VIEW, OTHER_ANGLES = ", even light across the swath assumed", 0.1
-"""Where each place is seen at one angle, as by one strip: fields hide what falls from side to side. And standard
-deviation of the angles at which one place is seen, over that of all, from which it shows: of light that falls by a
-fifth, 2 % are a trend then (LEAST_SPREAD)."""
+OTHER_ANGLES = 0.1
+"""Standard deviation of the angles at which one place is seen, over that of all, from which light that falls from side
+to side shows: of light that falls by a fifth, 2 % are a trend then (LEAST_SPREAD)."""
 
 _Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper corner in x and y [m]."""

@@ -37,6 +37,10 @@ what these two make together."""
 USUAL_CHANGE = 0.35
 """By how much another gain or energy changes light (standard deviation of the logarithm): factors of 0.7 to 1.4."""
 
+USUAL_SIDES = 0.1
+"""By how much light that is uneven across the swath grows from half to half (standard deviation of the logarithm;
+assumed, since no figure was found): 20 % from edge to edge, as of a dirty window."""
+
 SUNLIGHT = 0.1
 """By how much sunlight changes the noise of one gain (standard deviation of the logarithm)."""
 
@@ -89,6 +93,9 @@ FADING_PARTS, LEAST_OF_PART = 16, 50
 
 FEW_PARTS = 1.3
 """Factor of an error that so few parts tell, for surfaces that lie in no order."""
+
+LEAST_FACING = 0.1
+"""Least cosine by which light is divided: grazing rays tell nothing."""
 
 CELLS, LEAST_OF_CELL, LEAST_CELLS = (8, 32), 4, 50
 """Mean numbers of sampled waveforms of the cells in which light is compared with time; fewest of one that counts, and
@@ -177,11 +184,15 @@ class Setting(NamedTuple):
     """None where there is no rate."""
     straight: float = 1.0
     """Way from the start to the end of the flight over the length of its path; of several lines, of all together."""
+    sides: tuple[Change, ...] = ()
+    """How light grows from one half of the swath to the other, and from its middle to both edges; empty where the
+    flight has no right side."""
 
 
 def weigh_change(
-    shift: float, spread: float, noise: float | None = None, *, chance: float, usual: float = 0.0
-) -> Change:
+    shift: float, spread: float, noise: float | None = None, *, chance: float, usual: float = 0.0,
+    most: float = USUAL_CHANGE,
+) -> Change:  # fmt: skip
     """Weigh whether light differs by its surfaces, or by another energy or gain.
 
     Parameters
@@ -196,6 +207,8 @@ def weigh_change(
         Of another energy or gain before light and noise are seen.
     usual : float
         By how much air and laser change light in any case (standard deviation of the logarithm).
+    most : float
+        By how much a change changes light (standard deviation of the logarithm).
 
     Returns
     -------
@@ -209,7 +222,7 @@ def weigh_change(
     known = np.diag([spread**2, 1e6 if noise is None else SUNLIGHT**2])
     chances, squares = [], []
     for prior, moves in [(1.0 - chance, (0.0, 0.0)), *((chance / len(CHANGES), moves) for moves in CHANGES)]:
-        light = USUAL_CHANGE**2 * np.outer(moves, moves) + np.diag([usual**2, 0.0])
+        light = most**2 * np.outer(moves, moves) + np.diag([usual**2, 0.0])
         inverse = np.linalg.inv(known + light)
         chances.append(prior * np.exp(-0.5 * seen @ inverse @ seen) * np.sqrt(np.linalg.det(inverse)))
         squares.append((light[0] @ inverse @ seen) ** 2 + light[0, 0] - light[0] @ inverse @ light[0])
@@ -297,9 +310,10 @@ def measure_setting(
     chance: of a laser that fades, before the light is seen."""
     known = _read_rows(reader, scan, sensor, attenuation, energy)
     rate = _measure_rate(reader)
-    every = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
+    every = np.concatenate([np.empty((9, 0)), *known.values()], axis=1)
     zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
-    brightest, scenes, places, fading = {}, {}, {}, [NO_CHANGE]
+    right, straight = _find_right(every[0], every[6:8])
+    brightest, scenes, places, fading, sides = {}, {}, {}, [NO_CHANGE], []
     for channel, rows in known.items():
         time, light, east, north = rows[:4]
         brightest[channel] = float(np.quantile(light, BRIGHT))
@@ -309,9 +323,23 @@ def measure_setting(
         fading.append(_find_fading(time, light, rows[2:4], chance=chance))
         lines = _compare_lines(time, np.log(light), rows[2:4], chance=chance)
         fading += [lines] if lines.chance > LIKELY else []
-    fades = max(fading, key=lambda one: one.error)
-    right, straight = _find_right(every[0], every[6:8])
-    return Setting(rate, brightest, scenes, places, right, fades, zone, straight)
+        sides += [_find_sides(rows, right, chance=chance)] if straight >= LEAST_STRAIGHT else []
+    fades, *uneven = (max(found, key=lambda one: one.error) for found in (fading, *zip(*sides, strict=True)))
+    return Setting(rate, brightest, scenes, places, right, fades, zone, straight, tuple(uneven))
+
+
+def _find_sides(rows: np.ndarray, right: tuple[float, float], *, chance: float) -> tuple[Change, ...]:
+    """How light grows from one half of the swath to the other, and from its middle to both edges.
+
+    rows: as `_read_rows`. What a hillside does to light is taken off by the plane of the strip's ground.
+    """
+    x, y, z, down = rows[2:6]
+    east, north = rows[2:4] - rows[6:8]
+    slope = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), z, rcond=None)[0]
+    light = rows[1] / np.maximum(down + (slope[0] * east + slope[1] * north) / rows[8], LEAST_FACING)
+    across = (right[0] * east + right[1] * north) / rows[8]
+    both = across, np.abs(across)
+    return tuple(_find_fading(one, light, rows[2:4], chance=chance / 2, most=USUAL_SIDES) for one in both)
 
 
 def _find_right(time: np.ndarray, place: np.ndarray) -> tuple[tuple[float, float], float]:
@@ -340,8 +368,8 @@ def refuse_headings(reader: StripReader, found: Setting) -> None:
 def _read_rows(
     reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float, energy: float = 1.0
 ) -> dict[_Channel, np.ndarray]:
-    """Of a sample of each channel, f8 (8, n): time, light, place of the brightest sample, cosine of the ray's angle to
-    the vertical, and x and y of the sensor."""
+    """Of a sample of each channel, f8 (9, n): time, light, place of the brightest sample, cosine of the ray's angle to
+    the vertical, x and y of the sensor, and the distance to it."""
     parts: dict[_Channel, list[np.ndarray]] = {}
     for block in reader.sample_blocks(scan, SAMPLE):
         block = sensor.fill(block)
@@ -354,7 +382,7 @@ def _read_rows(
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation) / energy
             down = -away[:, 2] / distance
-        rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, down, *block.sensor.T[:2]])
+        rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, down, *block.sensor.T[:2], distance])
         scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
         for number in np.unique(scanner).tolist():
             parts.setdefault((block.digitizer.index, number), []).append(rows[:, (whole > 0) & (scanner == number)])
@@ -367,7 +395,7 @@ def doubt_zone(reader: StripReader, scan: StripScan, sensor: SensorSource) -> tu
     rate = _measure_rate(reader)
     if not rate or not 0.0 < 1e9 * HALF_C / rate < np.inf:
         return ()
-    rows = np.concatenate([np.empty((8, 0)), *_read_rows(reader, scan, sensor, AIR_ATTENUATION).values()], axis=1)
+    rows = np.concatenate([np.empty((9, 0)), *_read_rows(reader, scan, sensor, AIR_ATTENUATION).values()], axis=1)
     if not rows.size:
         return ()
     try:
@@ -381,7 +409,7 @@ def doubt_zone(reader: StripReader, scan: StripScan, sensor: SensorSource) -> tu
 def _find_zone(reader: StripReader, rows: np.ndarray, size: float) -> Zone:
     """Measure how the ground is bent across the flight; InputError where that, or jumps, show a wrong pulse zone.
 
-    rows: f8 (8, n), of which 0 is the time, and 2 to 5 are x, y, z and the cosine of the ray's angle to the vertical;
+    rows: f8 (9, n), of which 0 is the time, and 2 to 5 are x, y, z and the cosine of the ray's angle to the vertical;
     size: way of light between two pulses, one way [m]. Ranges that are too short by s lift the ground by s times that
     cosine.
     """
@@ -435,7 +463,9 @@ def keep_places(places: Mapping[_Channel, np.ndarray]) -> tuple[float, ...]:
     return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
 
 
-def _find_fading(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chance: float) -> Change:
+def _find_fading(
+    time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chance: float, most: float = USUAL_CHANGE
+) -> Change:
     """How light grows from the first half of a strip to the second; place: east and north, f8 (2, n).
 
     By a line through the scenes of its parts: what parts scatter about the line is their surfaces' doing. Fields,
@@ -456,7 +486,7 @@ def _find_fading(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chan
     for error, slope in find_growth_in_cells(time, np.log(light), place):
         found.append((float(np.hypot(SAME_GROUND, half * error)), half * slope))
     spread, shift = min(found)
-    return weigh_change(shift, spread, chance=chance)
+    return weigh_change(shift, spread, chance=chance, most=most)
 
 
 def find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray) -> Iterator[tuple[float, float]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -26,7 +26,7 @@ from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.attribute.radiometry import AIR_DOUBT
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
+from wavebatch.surveying.calibration import ONE_VIEW, Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.matching import setting as settings
 from wavebatch.surveying.sensor import FOOT, SensorSource
@@ -61,6 +61,13 @@ HIDDEN = 0.05
 
 FROM_START = 2.0 / 3.0**0.5
 """Root mean square over a strip of light that changes evenly from its start, over the change from half to half."""
+
+SIDES = ("from half to half of the swath", "between its middle and its edges")
+"""Of `Setting.sides`."""
+
+ANYWHERE = (2.0 / 3.0) ** 0.5
+"""Root mean square of what even growth across a swath changes between two places anywhere in it, a target's and an
+echo's, over the growth from half to half."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -257,6 +264,29 @@ def judge_fading(
     ]
 
 
+def judge_sides(calibration: Calibration, sides: Sequence[settings.Change]) -> tuple[float, list[str], list[str]]:
+    """Error of the constant by light that is uneven across the swath, relative, the warnings, and what would not show.
+
+    Overlaps of strips that were calibrated together show it themselves, where they saw places at several angles.
+    """
+    if not calibration.conditions.endswith(ONE_VIEW) or calibration.swath:
+        return 0.0, [], []
+    seen = [one.chance > settings.LIKELY for one in sides]
+    error = math.hypot(*(abs(one.shift) if named else one.error for one, named in zip(sides, seen, strict=True)))
+    growth, remedy = math.expm1(ANYWHERE * error), "calibrate strips of several headings with --scan-angle"
+    lines = [
+        f"calibration: light falls {way} by {100 * -math.expm1(-abs(one.shift)):.0f} %, as behind a dirty window, or "
+        f"where surfaces are not matt: {100 * growth:.0f} % of error of the constant hold it; {remedy}"
+        for one, named, way in zip(sides, seen, SIDES, strict=False)
+        if named
+    ]
+    hidden = (
+        "calibration: surfaces hide whether light is even across the swath: "
+        f"{100 * growth:.0f} % of error hold it, by an assumed chance (change_chance); {remedy}"
+    )
+    return growth, lines, [hidden] if growth > HIDDEN and not lines else []
+
+
 OTHER_WIDTH, NEAR_WIDTH = 1.25, 1.03
 """Ratios of the pulse widths of calibration and strip: above the first it is another pulse, above the second it may be
 one, and the error grows by the difference. Surveys of a sensor's strips agree within 2 % where ground is not steep."""
@@ -356,6 +386,8 @@ def match_strip(
         # Light that is seen to fade from the calibrated level on also moves the mean, which the first error holds.
         growth = max(growth, more) if lines else math.hypot(growth, more)
         reasons, notes = [*reasons, *lines], [*notes, *hidden]
+    more, lines, hidden = judge_sides(calibration, setting.sides)
+    growth, reasons, notes = math.hypot(growth, more), [*reasons, *lines], [*notes, *hidden]
     warnings += reasons
     own, divergence = system.radiometry.divergence, calibration.divergence
     if own is not None and divergence is not None and abs(own / divergence - 1.0) > SAME_DIVERGENCE:
