@@ -193,7 +193,8 @@ static void join_broad(const Settings *s, Work *work) {
     /* The pulse's misfit may explain one fall, not one for each: several proven echoes would fall together. */
     const double target = best->cost + (k - 2) * s->acceptance + least_fall(s, k, a, work->window.std);
     fit_window(1, 3, s, &limits, &none, target, work);
-    if (!work->fit.hopeless && work->fit.converged && work->fit.cost < target) describe_fit(s, &limits, work, &work->best);
+    const int is_broad = work->fit.parameters[2] >= s->width_high; /* else it is one of them, and the others are gone */
+    if (is_broad && !work->fit.hopeless && work->fit.converged && work->fit.cost < target) describe_fit(s, &limits, work, &work->best);
 }
 
 /* Errors of the best fit once more, with what is known of its amplitudes. */
