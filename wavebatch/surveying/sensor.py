@@ -406,7 +406,7 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     if (along is None or is_feet) and _look_like_degrees(reader) and ratio > 0.01:  # those in degrees are below 1e-5
         raise InputError(
             f"{path}: coordinates are degrees, packet vectors metres, so new echoes would be misplaced: project the "
-            "strip with its vectors to metres, or write only its own points with --points returns"
+            "strip with its vectors to metres, or write only its own points with `run --points returns`"
         )
     scale, bent, pairs, _ = measure_scale(reader, scan)
     bends: tuple[str, ...] = ()
@@ -425,7 +425,7 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
             raise InputError(
                 f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
                 f"coordinates are {words}, so new echoes would be misplaced: project the strip to metres, or write "
-                "only its own points with --points returns"
+                "only its own points with `run --points returns`"
             )
     return bends
 
