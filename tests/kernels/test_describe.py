@@ -43,7 +43,8 @@ def test_the_sum_of_echoes_is_that_of_a_loop(shape, rng):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_descriptions_are_those_of_a_loop(shape, noise, rng):
     sums, changes = _problem(shape, rng), (0.0, 0.02, 0.0)
-    length, volume = describe.describe_left(sums, noise, changes)
+    length, volume, *nothing = describe.describe_left(sums, noise, changes)
+    assert nothing == [None, None]
     np.testing.assert_array_equal(length[0], length[2])
     for i in range(len(sums.left)):
         planes = (sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i])
@@ -57,7 +58,11 @@ def test_descriptions_are_those_of_a_loop(shape, noise, rng):
 @pytest.mark.parametrize("noise", NOISES)
 def test_changes_are_those_of_a_loop(noise, rng):
     sums = _problem(SHAPES[2], rng)
-    change, precision = describe.measure_changes(sums, noise)
+    plain, (*same, change, precision) = (
+        describe.describe_left(sums, noise, [0.0], strongest=asked) for asked in (False, True)
+    )
+    for one, other in zip(plain, same, strict=False):
+        np.testing.assert_array_equal(one, other)
     for i in range(len(sums.left)):
         if not _echoes(sums, i):
             assert not precision[i].any()
@@ -87,7 +92,7 @@ def test_many_echoes_of_a_long_waveform_take_time_in_proportion(rng):
     main = np.stack([rng.uniform(5, 90, m), np.sort(rng.uniform(0, 65_535, m)), np.full(m, 2.0)], axis=1)
     model = describe.render_pulses(PulseShape(), 1, 65_535, np.zeros(m, int), main)
     sums = describe.Sums(PulseShape(), np.array([0, m]), main, np.zeros_like(model), model, np.ones(model.shape, bool))
-    length, volume = describe.describe_left(sums, describe.SampleNoise(1.0), [0.01])
+    length, volume, *_ = describe.describe_left(sums, describe.SampleNoise(1.0), [0.01])
     assert np.isfinite(length).all() and np.isfinite(volume).all()
 
 

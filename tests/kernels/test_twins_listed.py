@@ -21,7 +21,6 @@ COMPILED = {
     "describe_widths": ("describe_widths", "naive_describe.describe_widths"),
     "learn_pulse": ("gather_pulse", "naive_describe.gather"),
     "render_pulses": ("render_pulses", "naive_describe.render"),
-    "measure_changes": ("measure_changes", "naive_describe.measure_change"),
     "pair_differences": ("measure_covariance", "naive_signal.measure_covariance"),
     "judge_packets": ("judge_packets", "naive_packets.judge_packet"),
     "interpolate_columns": ("interpolate", "np.interp"), "fit_stack": ("refine_gaussians", "naive_fit.fit_stack"),

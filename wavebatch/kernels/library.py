@@ -21,7 +21,7 @@ _BYTE: Any = ctypes.c_char.from_buffer  # of an array
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "filter_rows", "find_maxima", "find_correlated",
     "group_candidates", "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms",
-    "describe_widths", "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
+    "describe_widths", "learn_pulse", "render_pulses", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes", "match_returns", "weigh_fits",
     "finish_echoes", "find_pulses", "find_nearest", "number_returns", "share_offsets", "find_around",
     "measure_lobes", "find_two_lines", "trim_planes", "coloured_variance", "fit_factors",
@@ -310,7 +310,8 @@ class Samples(NamedTuple):
             raise ValueError("levels and noise must be finite, and the noise above 0")
         if level_err is not None and not np.isfinite(level_err).all():
             raise ValueError("errors of levels must be finite")
-        if counts.dtype == np.float32 and not np.isfinite(counts if missing is None else counts[~missing]).all():
+        known = np.True_ if counts.dtype != np.float32 else np.isfinite(counts)
+        if not (known if missing is None else known | missing).all():
             raise ValueError("samples must be finite where they are not missing")
 
     def as_block(self) -> Block:

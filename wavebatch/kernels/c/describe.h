@@ -168,6 +168,8 @@ static void find_bend(const Described *w, Desk *d, int64_t echo, Bend *bend) {
     }
 }
 
+static const double UNBOUND = 1e3;             /* change of a shape that bounds nothing */
+
 /* Height of a direction in what is left, where a change of the pulse from shot to shot makes so much likely. */
 static double find_height(const Bend *bend, int64_t r, const lanes *rest, double change) {
     return multiply(bend->vectors, bend->rows + r * bend->vectors, rest + bend->from) / (bend->energy[r] + 1 / (change * change));
@@ -207,12 +209,14 @@ static double measure_rest(const Described *w, int64_t i, const float *rest) {
 }
 
 /* Length of what the echoes leave of each waveform, with what its shapes cost, for each of `number` changes of the pulse,
-   (number, n); and the volume that echoes share, (n). */
-EXPORT int64_t describe_waveforms(const Described *w, int64_t number, const double *changes, double *length, double *volume) {
+   (number, n); and the volume that echoes share, (n). Unless NULL: change of the shape of the strongest echo in two
+   directions, as a share of its amplitude, and one over the variance of each, (n, 2); 0 where there is no echo. */
+EXPORT int64_t describe_waveforms(const Described *w, int64_t number, const double *changes, double *length, double *volume,
+                                  double *heights, double *energies) {
     Desk d = {0};
     Bend bends[CHANGED];
     const int64_t vectors = VECTORS(w->length);
-    int good = furnish(&d, 3 * TOGETHER, vectors), most = 0;
+    int good = furnish(&d, 3 * TOGETHER, vectors), most = heights ? 1 : 0;
     for (int64_t c = 0; c < number; c++) most = changes[c] > 0 ? CHANGED : most;
     for (int64_t i = 0; i < w->n && good; i++) {
         const int64_t first = w->first[i], end = w->first[i + 1];
@@ -224,6 +228,10 @@ EXPORT int64_t describe_waveforms(const Described *w, int64_t number, const doub
             bends[bent].rows = d.modes + (6 + 2 * bent) * vectors;
             find_bend(w, &d, echo, bends + bent);
         }
+        for (int64_t r = 0; heights && r < 2; r++) {
+            heights[2 * i + r] = bent ? find_height(bends, r, d.rest, UNBOUND) : 0;
+            energies[2 * i + r] = bent ? bends->energy[r] : 0;
+        }
         for (int64_t c = 0; c < number; c++) {
             double cost = sum;
             memcpy(rest, d.rest, vectors * sizeof(lanes));
@@ -232,30 +240,6 @@ EXPORT int64_t describe_waveforms(const Described *w, int64_t number, const doub
         }
         volume[i] = 0;
         for (int64_t j = first; j < end; j += TOGETHER) volume[i] += shared_volume(w, &d, j, end - j < TOGETHER ? end - j : TOGETHER);
-    }
-    clear_desk(&d);
-    return good ? 0 : -1;
-}
-
-/* Change of the shape of the strongest echo of each waveform in two directions, as a share of its amplitude, and one over
-   the variance of each, (n, 2); 0 where there is no echo. */
-EXPORT int64_t measure_changes(const Described *w, double *heights, double *energies) {
-    Desk d = {0};
-    Bend bend;
-    int good = furnish(&d, 1, VECTORS(w->length));
-    memset(heights, 0, 2 * w->n * sizeof(double));
-    memset(energies, 0, 2 * w->n * sizeof(double));
-    for (int64_t i = 0; i < w->n && good; i++) {
-        int64_t echo = next_strongest(w, w->first[i], w->first[i + 1], -1);
-        if (echo < 0) continue;
-        lay_out(w, i, &d);
-        innovate(w, d.rest, d.vectors);
-        bend.rows = d.modes + 5 * d.vectors;
-        find_bend(w, &d, echo, &bend);
-        for (int64_t r = 0; r < 2; r++) {
-            heights[2 * i + r] = find_height(&bend, r, d.rest, w->change);
-            energies[2 * i + r] = bend.energy[r];
-        }
     }
     clear_desk(&d);
     return good ? 0 : -1;

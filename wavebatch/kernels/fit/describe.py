@@ -20,10 +20,6 @@ LEAST_LEFT = 0.02
 """Least share of the noise's variance that the two samples before leave open: an estimated correlation may be none."""
 
 
-UNBOUND = 1e3
-"""Change of a shape that bounds nothing."""
-
-
 class Sums(NamedTuple):
     """n waveforms of s samples, and sums of pulses in them."""
 
@@ -78,7 +74,21 @@ def count_echoes(waveform: np.ndarray, n: int) -> np.ndarray:
     return np.concatenate(([0], np.cumsum(np.bincount(waveform, minlength=n)))).astype(np.int64, copy=False)
 
 
-def describe_left(sums: Sums, noise: SampleNoise, changes: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+class Left(NamedTuple):
+    """What echoes leave of n waveforms, and how the shape of the strongest one of each differs from the pulse."""
+
+    length: np.ndarray
+    """For each of k changes of the pulse, float64 (k, n): negative logarithm of the likelihood [nats], by Student's law
+    with four degrees of freedom of what the two samples before do not predict; with the cost of the changes."""
+    volume: np.ndarray
+    """Half the negative logarithm of the determinant of the correlation matrix of all parameters [nats], float64 (n,)."""
+    change: np.ndarray | None
+    """In two directions, as a share of the echo's energy, by least squares, float64 (n, 2); None where not asked for."""
+    precision: np.ndarray | None
+    """One over the variance of each; 0 for a waveform without an echo."""
+
+
+def describe_left(sums: Sums, noise: SampleNoise, changes: Sequence[float], *, strongest: bool = False) -> Left:
     """Return how long the description of what echoes leave is, and how much less their errors say together than alone.
 
     Parameters
@@ -88,23 +98,22 @@ def describe_left(sums: Sums, noise: SampleNoise, changes: Sequence[float]) -> t
     changes : sequence of float, k of them
         How much the pulse's shape changes from shot to shot, as a share of its amplitude: the three strongest echoes of
         a waveform may leave so much in the two directions (Gauss-Hermite h3 and h4) that follow those of the fit.
+    strongest : bool
+        Whether the shapes of the strongest echoes are asked for.
 
     Returns
     -------
-    length : float64 (k, n)
-        Negative logarithm of the likelihood [nats], by Student's law with four degrees of freedom of what the two
-        samples before do not predict; with the cost of the changes.
-    volume : float64 (n,)
-        Half the negative logarithm of the determinant of the correlation matrix of all parameters [nats].
+    Left
 
     References
     ----------
     docs/algorithms.md R2.
     """
     tried, n = np.array(changes, np.float64), len(sums.left)
-    length, volume = np.zeros((len(tried), n)), np.zeros(n)
-    call("describe_waveforms", _as_structure(sums, noise, 0.0), ctypes.c_int64(len(tried)), tried, length, volume)
-    return length, volume
+    change, precision = np.zeros((2, n, 2)) if strongest else (None, None)
+    left = Left(np.zeros((len(tried), n)), np.zeros(n), change, precision)
+    call("describe_waveforms", _as_structure(sums, noise, 0.0), ctypes.c_int64(len(tried)), tried, *left)
+    return left
 
 
 def describe_widths(
@@ -148,26 +157,6 @@ def describe_widths(
         ctypes.c_int64(len(scatter)), scatter, ctypes.c_int64(len(ends)), ends, ctypes.c_double(anywhere), cost,
     )  # fmt: skip
     return cost
-
-
-def measure_changes(sums: Sums, noise: SampleNoise) -> tuple[np.ndarray, np.ndarray]:
-    """Return how the shape of the strongest echo of each waveform differs from the pulse.
-
-    Parameters
-    ----------
-    sums : Sums
-    noise : SampleNoise
-
-    Returns
-    -------
-    change : float64 (n, 2)
-        In the two directions of `describe_left`, as a share of the echo's energy; by least squares.
-    precision : float64 (n, 2)
-        One over the variance of each; 0 for a waveform without an echo.
-    """
-    change, precision = np.zeros((len(sums.left), 2)), np.zeros((len(sums.left), 2))
-    call("measure_changes", _as_structure(sums, noise, UNBOUND), change, precision)
-    return change, precision
 
 
 def gather_pulse(

@@ -19,7 +19,7 @@ from wavebatch.core.order import distinct, quantile
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
-from wavebatch.kernels.fit.describe import describe_left
+from wavebatch.kernels.fit.describe import Left, describe_left
 from wavebatch.stages.pulse_tables import clip_level, shape_limits
 from wavebatch.surveying.measuring.joint_pulse import MOST_ECHOES, learn_jointly
 from wavebatch.surveying.measuring.judge import (
@@ -353,10 +353,11 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     gaussians = max(len(system.components), 1)
     used = max(int(np.count_nonzero(explained.sums.used)), 1)
     written = 0.0 if known else 3 * gaussians * 0.5 * log(used) / len(block)
-    length = describe_waveforms(block, borne, explained, [change])[0] + written
+    left = describe_left(explained.sums, sample_noise(borne), [change], strongest=True)
+    length = describe_waveforms(block, borne, explained, [change], left)[0] + written
     return Candidate(
         name, system, change, length, len(explained.echoes), len(distinct(explained.echoes.waveform)), known,
-        2 if known else gaussians, measure_change(borne, explained),
+        2 if known else gaussians, measure_change(left),
         find_own_width(explained, shape_limits(borne, block.spacing).ref),
     )
 
@@ -620,7 +621,7 @@ class Looked(NamedTuple):
     """Waveforms decomposed with one misfit."""
 
     explained: Explained
-    left: tuple[np.ndarray, np.ndarray]
+    left: Left
     """What `describe_left` says of each of them."""
 
 
@@ -633,10 +634,11 @@ def _explain_between(
     if below is None or above is None:
         explained = explain(block, system)
         return Looked(explained, describe_left(explained.sums, sample_noise(system), changes))
-    near, length, volume = found[below], *(one.copy() for one in found[below].left)
+    near = found[below]
     rows = find_changed(near.explained, found[above].explained)
     if not len(rows):
         return near
     part = explain(block.rows(rows), system)
-    length[:, rows], volume[rows] = describe_left(part.sums, sample_noise(system), changes)
-    return Looked(replace_rows(near.explained, rows, part), (length, volume))
+    length, volume = (one.copy() for one in near.left[:2])
+    length[:, rows], volume[rows] = describe_left(part.sums, sample_noise(system), changes)[:2]
+    return Looked(replace_rows(near.explained, rows, part), Left(length, volume, None, None))

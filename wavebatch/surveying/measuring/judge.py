@@ -19,12 +19,12 @@ from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.describe import (
+    Left,
     SampleNoise,
     Sums,
     count_echoes,
     describe_left,
     describe_widths,
-    measure_changes,
     render_pulses,
 )
 from wavebatch.stages.detect.direct import matched_filter
@@ -115,13 +115,13 @@ def sample_noise(system: SystemPulse) -> SampleNoise:
     return SampleNoise(system.noise.quiet, system.noise.gain, system.noise.correlation)
 
 
-def measure_change(system: SystemPulse, explained: Explained) -> float:
-    """Measure how much the pulse changes from shot to shot, as a share of its amplitude.
+def measure_change(left: Left) -> float:
+    """Measure how much the pulse changes from shot to shot, as a share of its amplitude, by what echoes leave.
 
     By the median over the strongest echoes of the waveforms: a pulse that changes does so in each of them, neighbours
     that are too close to be found change the shape of some. 0 with too few of them, or where noise explains all.
     """
-    change, precision = measure_changes(explained.sums, sample_noise(system))
+    change, precision = left.change, left.precision
     known = precision > 0
     if np.count_nonzero(known) < 2 * LEAST_KNOWN:
         return 0.0
@@ -134,7 +134,7 @@ def describe_waveforms(
     system: SystemPulse,
     explained: Explained,
     changes: Sequence[float],
-    left: tuple[np.ndarray, np.ndarray] | None = None,
+    left: Left | None = None,
 ) -> np.ndarray:
     """Measure how long the description of each waveform is: its echoes, and what they leave.
 
@@ -146,7 +146,7 @@ def describe_waveforms(
         The block decomposed with this system, of any misfit.
     changes : sequence of float, k of them
         Of the pulse from shot to shot, as shares of its amplitude (`describe_left`).
-    left : pair of float64 arrays, optional
+    left : Left, optional
         What `describe_left` says of the waveforms, where it is known.
 
     Returns
@@ -163,12 +163,13 @@ def describe_waveforms(
     """
     echoes, sums = explained.echoes, explained.sums
     n, s = sums.left.shape
-    length, volume = describe_left(sums, sample_noise(system), changes) if left is None else left
+    left = left or describe_left(sums, sample_noise(system), changes)
     ratio, error, known = _measure_widths(echoes, echoes.sigma.astype(np.float64) / system.sigma_ref)
     amplitude = echoes.amplitude.astype(np.float64)
     typical = max(float(np.mean(amplitude)), 1.0) if len(amplitude) else 1.0
-    by_time = np.clip(np.nan_to_num(echoes.time_err / block.spacing, nan=s), 1e-3, s)
-    by_amplitude = np.maximum(np.nan_to_num(echoes.amplitude_err, nan=typical), 1e-3 * system.noise.quiet)
+    by_time = np.maximum(np.fmin(echoes.time_err / block.spacing, s), 1e-3)
+    unknown = np.isnan(echoes.amplitude_err)
+    by_amplitude = np.maximum(np.where(unknown, np.float32(typical), echoes.amplitude_err), 1e-3 * system.noise.quiet)
     cost = np.maximum(log(s / (SQRT_2PI * by_time)), 0.0)
     cost += np.maximum(log(typical / (SQRT_2PI * by_amplitude)), 0.0) + log(1.0 + (amplitude / typical) ** 2)
     if np.count_nonzero(known) >= LEAST_KNOWN:
@@ -178,7 +179,7 @@ def describe_waveforms(
     # Of k echoes in any order: their factorial is the number of orders.
     orders = np.r_[0.0, np.cumsum(log(np.arange(1.0, max(int(number.max(initial=0)), 1) + 1)))]
     count = log(1 + mean) - number * log(mean / (1 + mean)) - orders[number]
-    return length + volume + count + np.bincount(echoes.waveform, cost, minlength=n)
+    return left.length + left.volume + count + np.bincount(echoes.waveform, cost, minlength=n)
 
 
 def count_errors(values: np.ndarray) -> float:
@@ -221,6 +222,6 @@ def find_own_width(explained: Explained, ref: float) -> float:
 def _measure_widths(echoes: EchoTable, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Widths over the pulse's, their errors, and which of them are known (m,)."""
     with np.errstate(invalid="ignore"):
-        error = np.nan_to_num(echoes.sigma_err / np.maximum(echoes.sigma, 1e-6), nan=2.0).astype(np.float64)
-    error = np.clip(error, 1e-3, 2.0) * ratio
+        error = np.fmin(echoes.sigma_err / np.maximum(echoes.sigma, 1e-6), 2.0).astype(np.float64)
+    error = np.maximum(error, 1e-3) * ratio
     return ratio, error, ((echoes.flags & _DOUBTFUL) == 0) & (error < KNOWN * ratio)
