@@ -8,7 +8,7 @@ must get the same numbers every time, so the seed is fixed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -135,7 +135,7 @@ def leave_out_false(predictions: Sequence[Prediction]) -> list[Prediction]:
 
 
 def simulate_again(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, seed: int, length: int | None = None
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, seed: int, length: int | None = None, times: int = 1
 ) -> tuple[WaveformBlock, SystemPulse]:
     """Simulate waveforms that hold given echoes, with the strip's pulse, new baselines and new noise.
 
@@ -150,6 +150,8 @@ def simulate_again(
         Of the noise.
     length : int, optional
         Samples of a waveform; by default as many as in the block.
+    times : int
+        Parts of the block that have the same noise, one after the other.
 
     Returns
     -------
@@ -165,7 +167,7 @@ def simulate_again(
     # Noise that fits of this system see with a standard deviation of 1: coloured where they whiten it.
     z, below, _ = normal_law()
     normal = np.interp((np.arange(QUANTILES) + 0.5) / QUANTILES, below, z).astype(np.float32)
-    noise = normal[(QUANTILES * draw(seed, n, s + 1)).astype(np.int64)]
+    noise = normal[(QUANTILES * draw(seed, n // times, s + 1)).astype(np.int64)]
     noise, level = noise[:, :s], noise[:, s:]
     if system.noise.whitening:
         rows = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet).astype(np.float32)
@@ -174,6 +176,7 @@ def simulate_again(
             for j in range(1, before + 1):
                 noise[:, i] -= rows[before, j] * noise[:, i - j]
             noise[:, i] /= rows[before, 0]
+    noise, level = (np.concatenate(times * [one]) for one in (noise, level))
     signal += np.sqrt(variance).astype(np.float32) * noise
     signal += system.noise.baseline + system.noise.baseline_spread * level
     top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
@@ -238,7 +241,22 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     there are for each class of widths; the strip's echoes of that class say which share of them they are.
     """
     number = echoes.count(len(block))[echoes.waveform]
-    lone, others = (_measure_class(block, system, echoes, number, company) for company in (False, True))
+    # Echoes without and with another in their waveform: one that hides another was in a waveform with one more.
+    sources, asked = (number == 2, number > 2), []
+    for source in sources:
+        pick = np.flatnonzero(source & ((echoes.flags & np.uint16(_CUT)) == 0))
+        near = 0  # pairs of echoes of one waveform from NEAR to FAR apart
+        for step in (1, 2, 3):
+            gap = (echoes.time[step:] - echoes.time[:-step]) / system.sigma_ref
+            same = (echoes.waveform[step:] == echoes.waveform[:-step]) & source[step:]
+            near += int(np.count_nonzero(same & (gap >= NEAR) & (gap < FAR)))
+        asked.append((echoes.take(pick), near if len(pick) >= FEW else 0))
+    pairs = _hide_pairs(block, system, [part for part, near in asked if near])
+    expected = [near / (FAR - NEAR) * FAR / min(PAIRS, len(block)) for _, near in asked]
+    lone, others = (
+        _measure_class(system, echoes, number, rate, next(pairs), company=company) if rate else np.zeros((3, len(_MIDDLE)))
+        for company, rate in zip((False, True), expected, strict=True)
+    )
     if not (lone.any() or others.any()):
         return system
     # Too few groups of three: another neighbour is then as likely as a first one.
@@ -248,28 +266,19 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
 
 
 def _measure_class(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, number: np.ndarray, company: bool
-) -> np.ndarray:
+    system: SystemPulse, echoes: EchoTable, number: np.ndarray, expected: float, pairs: tuple[np.ndarray, ...],
+    *, company: bool,
+) -> np.ndarray:  # fmt: skip
     """Mean square of the shift over the excess variance, and the shares of others' light, and of the width that others
     make, over its root, that BEYOND of all echoes exceed (3, classes).
 
-    Of echoes with (company) or without another in their waveform. number: echoes in the waveform of each. An echo that
-    hides another was in a waveform with one more.
+    Of echoes with (company) or without another in their waveform. number: echoes in the waveform of each. pairs: as
+    `_hide_pairs` gives them; expected: how many of the strip's each of them stands for.
     """
-    nothing, source = np.zeros((3, len(_MIDDLE))), number > 2 if company else number == 2
-    pick = np.flatnonzero(source & ((echoes.flags & np.uint16(_CUT)) == 0))
-    near = 0  # pairs of echoes of one waveform from NEAR to FAR apart
-    for step in (1, 2, 3):
-        gap = (echoes.time[step:] - echoes.time[:-step]) / system.sigma_ref
-        same = (echoes.waveform[step:] == echoes.waveform[:-step]) & source[step:]
-        near += int(np.count_nonzero(same & (gap >= NEAR) & (gap < FAR)))
-    if len(pick) < FEW or not near:
-        return nothing
-    excess, shift, *shares = _hide_pairs(block, system, echoes.take(pick))
-    expected = near / (FAR - NEAR) * FAR / min(PAIRS, len(block))
+    excess, shift, *shares = pairs
     if company:
         # A group with one more, hidden echo looks smaller: its near pair was not counted.
-        groups = len(distinct(echoes.waveform[source]))
+        groups = len(distinct(echoes.waveform[number > 2]))
         expected /= 1.0 - min(expected * len(excess) / groups, MOST_LOST)
     clear = (echoes.amplitude > CLEAR * system.noise.std) & ((number > 1) if company else (number == 1))
     there = np.histogram(excess_variance(echoes.take(np.flatnonzero(clear)), system), EXCESS)[0]
@@ -286,24 +295,33 @@ def _measure_class(
     return np.stack([late, *beyond])
 
 
-def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[np.ndarray, ...]:
+def _hide_pairs(
+    block: WaveformBlock, system: SystemPulse, sources: list[EchoTable]
+) -> Iterator[tuple[np.ndarray, ...]]:
     """Excess variance of pairs that are found as one echo, its distance to the nearer target [widths of the pulse] and
-    the shares of its light and of its width that are not that target's.
+    the shares of its light and of its width that are not that target's. For each of the tables from which they come.
     """
+    if not sources:
+        return
     block = block.rows(slice(0, PAIRS))
     n, ref = len(block), system.sigma_ref
     length = min(block.samples.shape[1], LEVEL + int(np.ceil(AROUND * ref / block.spacing)))
     apart, shift, *source = draw(SEED, 4, n)
     half, middle = 0.5 * FAR * ref * apart, block.spacing * (0.5 * length + shift)
-    chosen = (len(echoes) * np.ravel(source)).astype(np.int64)
     time = np.stack([middle - half, middle + half], axis=1)
-    pairs = EchoTable.build(np.repeat(np.arange(n), 2), time.ravel(), echoes.amplitude[chosen], echoes.sigma[chosen])
-    found = decompose_sample(*simulate_again(block, system, pairs, SEED + 1, length), free_levels=True)
-    one = found.alone(n) & (found.amplitude > CLEAR * system.noise.std)
-    found = found.take(np.flatnonzero(one))
-    away = np.abs(time[found.waveform] - found.time[:, None])
-    nearer = pairs.take(2 * found.waveform + away.argmin(axis=1))
-    light = 1.0 - (nearer.amplitude * nearer.sigma).astype(np.float64) / (found.amplitude * found.sigma)
-    # The strip's widths hold hidden neighbours themselves: a target is no wider than the pulse here.
-    widened = 1.0 - np.minimum(nearer.sigma, ref) / found.sigma
-    return excess_variance(found, system), away.min(axis=1) / ref, light, widened
+    drawn = [echoes.take((len(echoes) * np.ravel(source)).astype(np.int64)) for echoes in sources]
+    rows, times = np.repeat(np.arange(n), 2), len(drawn)
+    every = [EchoTable.build(rows, time.ravel(), one.amplitude, one.sigma) for one in drawn]
+    both, waveforms = EchoTable.concatenate((one, n * i) for i, one in enumerate(every)), np.tile(np.arange(n), times)
+    trial = simulate_again(block.rows(waveforms), system, both, SEED + 1, length, times)
+    found = decompose_sample(*trial, free_levels=True)
+    part, alone = found.waveform // n, found.alone(times * n) & (found.amplitude > CLEAR * system.noise.std)
+    for i, pairs in enumerate(every):
+        one = found.take(np.flatnonzero(alone & (part == i)))
+        one = replace(one, waveform=one.waveform - np.int32(n * i))
+        away = np.abs(time[one.waveform] - one.time[:, None])
+        nearer = pairs.take(2 * one.waveform + away.argmin(axis=1))
+        light = 1.0 - (nearer.amplitude * nearer.sigma).astype(np.float64) / (one.amplitude * one.sigma)
+        # The strip's widths hold hidden neighbours themselves: a target is no wider than the pulse here.
+        widened = 1.0 - np.minimum(nearer.sigma, ref) / one.sigma
+        yield excess_variance(one, system), away.min(axis=1) / ref, light, widened
