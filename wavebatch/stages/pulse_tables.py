@@ -424,8 +424,11 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
 def _invert(table: PulseMeasures, echoes: np.ndarray) -> np.ndarray:
     """As model_parameters, with one table."""
     amplitude, time, sigma = echoes.T
+    if len(sigma) and (sigma == sigma[0]).all():  # candidates of most detectors are many, of one width
+        sigma = sigma[:1]
     width = np.interp(sigma, table.half_width / FWHM_PER_SIGMA, table.width)
-    return np.stack([amplitude / np.interp(width, table.width, table.peak), time, width], axis=1)
+    amplitude = amplitude / np.interp(width, table.width, table.peak)
+    return np.stack([amplitude, time, np.broadcast_to(width, time.shape)], axis=1)
 
 
 ReferenceKind = Literal["gaussian", "system", "given"]

@@ -102,7 +102,7 @@ def find_clusters(
 def _join_plateaus(block: WaveformBlock, candidates: decompose.Candidates, clip: float) -> decompose.Candidates:
     """Candidates, one for each flat top: clipped samples between two candidates are no sign of two echoes."""
     waveform, time, amplitude, _ = candidates
-    if len(waveform) < 2:
+    if len(waveform) < 2 or not (block.samples >= clip).any():
         return candidates
     pair = np.flatnonzero(waveform[1:] == waveform[:-1])
     present, row = np.unique(waveform[pair], return_inverse=True)

@@ -448,12 +448,14 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
             part = float(exp(middle))
             seen = whole & (least < LESS * part)
             alike = seen & (np.abs(level - middle) < SAME_SHARE)
+            with_it = np.count_nonzero(alike)
+            if with_it < REPEATED:
+                continue
             without = np.count_nonzero(seen & (highest < LESS * part) & (beside < part / LESS))
             # Higher echoes there are neighbours, and others of them are as high as the part: as many as in equal steps
             # of the logarithm, or as in the next one.
             above = level[seen & (highest > part / LESS)] - middle
             chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
-            with_it = np.count_nonzero(alike)
             least_number = max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1))
             if with_it < least_number or len(distinct(tenth[alike])) < PLACES:
                 continue
