@@ -454,7 +454,8 @@ def _decide(found: list[Candidate], *, small: bool = False) -> Choice:
         )
         for one in sorted(every, key=lambda one: one.typical)
     ]  # fmt: skip
-    other = any(one.gaussians != best.gaussians for one in tied) or off.max() > MOST_SPREAD or doubt > 1 - AS_FEW
+    other = any(one.gaussians != best.gaussians and not _saves_little(one, best) for one in tied)
+    other |= off.max() > MOST_SPREAD or doubt > 1 - AS_FEW
     return Choice(best, tuple(tried), doubt, spread, other)
 
 
@@ -474,16 +475,28 @@ def _save(shorter: Candidate, longer: Candidate) -> float:
     return (longer.typical - shorter.typical) * len(longer.length) / max(longer.echoes, 1)
 
 
+def _saves_little(shorter: Candidate, longer: Candidate) -> bool:
+    """Whether a candidate saves surely too little to be taken in place of another: more waveforms do not change that."""
+    error = np.std(shorter.length - longer.length) * np.sqrt(len(longer.length)) / max(longer.echoes, 1)
+    return bool(_save(shorter, longer) + SURE * error < _need_saved(shorter, longer))
+
+
 def _is_as_wide(one: Candidate, other: Candidate) -> bool:
     return abs(one.system.sigma_ref / other.system.sigma_ref - 1) <= OTHER_WIDTH
 
 
+def _need_saved(shorter: Candidate, longer: Candidate) -> float:
+    """Nats per echo that a candidate must save to be taken in place of another."""
+    if longer.known and not shorter.known and _is_as_wide(shorter, longer):
+        return LEAST_OF_KNOWN
+    return LEAST_SAVED if longer.gaussians == 1 < shorter.gaussians else 0.0
+
+
 def _beats(shorter: Candidate, longer: Candidate) -> bool:
     """Whether a candidate describes so much shorter that it is taken in place of the other."""
-    least = LEAST_SAVED if longer.gaussians == 1 < shorter.gaussians else 0.0
-    if longer.known and not shorter.known and _is_as_wide(shorter, longer):
-        least = LEAST_OF_KNOWN
-    return _save(shorter, longer) > least and longer.exceeds(shorter) > _bound_errors(shorter, longer)
+    if _save(shorter, longer) <= _need_saved(shorter, longer):
+        return False
+    return longer.exceeds(shorter) > _bound_errors(shorter, longer)
 
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
