@@ -197,6 +197,7 @@ def choose_pulse(
     given: Mapping[str, SystemPulse] | None = None,
     *,
     plain: bool = False,
+    many: bool = False,
 ) -> Choice:
     """Choose the pulse that describes waveforms in the fewest words.
 
@@ -212,6 +213,8 @@ def choose_pulse(
     plain : bool
         Whether lone echoes show no more than the start "gaussian": where all echoes have its width too, nothing else is
         tried.
+    many : bool
+        Whether lone echoes are so many that what they teach jointly is known as well as a pulse of all echoes.
 
     Returns
     -------
@@ -246,6 +249,11 @@ def choose_pulse(
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
+    # All echoes teach no other pulse than many alone in their waveforms do, with the same freedom.
+    gaussian = not (begin.system.components or begin.system.kappa)
+    if jointly in looked and many and gaussian and _saves_little(jointly, begin):
+        plain, own = True, _find_gaussian(taught, begin.system, CHANGES[1])
+        hopeful = [one for one in hopeful if one is not jointly]
     learned = [] if plain else _learn(taught, judged, begin)
     # Where too few echoes teach further, what lone echoes teach jointly stands for itself.
     tried = {one.name: one.system for one in hopeful if one.name != JOINTLY or not learned}
