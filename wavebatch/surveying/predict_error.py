@@ -253,8 +253,9 @@ def measure_hidden(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
         asked.append((echoes.take(pick), near if len(pick) >= FEW else 0))
     pairs = _hide_pairs(block, system, [part for part, near in asked if near])
     expected = [near / (FAR - NEAR) * FAR / min(PAIRS, len(block)) for _, near in asked]
+    nothing = np.zeros((3, len(_MIDDLE)))
     lone, others = (
-        _measure_class(system, echoes, number, rate, next(pairs), company=company) if rate else np.zeros((3, len(_MIDDLE)))
+        _measure_class(system, echoes, number, rate, next(pairs), company=company) if rate else nothing
         for company, rate in zip((False, True), expected, strict=True)
     )
     if not (lone.any() or others.any()):

@@ -17,7 +17,7 @@ from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
-from wavebatch.surveying.measuring.choose_pulse import ALONE, JOINTLY, STACKED, SUMMED, bear, choose_pulse, learn_alone, settle
+from wavebatch.surveying.measuring.choose_pulse import JOINTLY, STACKED, SUMMED, bear, choose_pulse, learn_alone, settle
 from wavebatch.surveying.measuring.joint_pulse import LEAST_CHANGE
 from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse, measure_skew
@@ -263,7 +263,7 @@ def _survey(
         plain = len(block) >= SMALL and figures.misfit_gaussians.get(1, np.inf) <= (figures.misfit_goal or 0.0)
         if STACKED in starts and not plain:
             starts[JOINTLY] = learn_alone(block.rows(main.waveform), starts[STACKED])
-        known, many = list_known(block, system), len(main) >= ALONE
+        known, many = list_known(block, system), len(main) >= SMALL
         choice = choose_pulse(thin_empty(block, system), starts, known, plain=plain, many=many)
         # Starts of guessed widths are measured from nothing, and know no defects.
         system = replace(choice.best.system, defects=first.defects, faint_share=MOST_FAINT)

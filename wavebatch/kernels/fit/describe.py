@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -81,10 +81,10 @@ class Left(NamedTuple):
     """For each of k changes of the pulse, float64 (k, n): negative logarithm of the likelihood [nats], by Student's law
     with four degrees of freedom of what the two samples before do not predict; with the cost of the changes."""
     volume: np.ndarray
-    """Half the negative logarithm of the determinant of the correlation matrix of all parameters [nats], float64 (n,)."""
-    change: np.ndarray | None
-    """In two directions, as a share of the echo's energy, by least squares, float64 (n, 2); None where not asked for."""
-    precision: np.ndarray | None
+    """Half the negative logarithm of the determinant of all parameters' correlation matrix [nats], float64 (n,)."""
+    change: np.ndarray
+    """In two directions, as a share of the echo's energy, by least squares, float64 (n, 2); None where not asked."""
+    precision: np.ndarray
     """One over the variance of each; 0 for a waveform without an echo."""
 
 
@@ -110,8 +110,8 @@ def describe_left(sums: Sums, noise: SampleNoise, changes: Sequence[float], *, s
     docs/algorithms.md R2.
     """
     tried, n = np.array(changes, np.float64), len(sums.left)
-    change, precision = np.zeros((2, n, 2)) if strongest else (None, None)
-    left = Left(np.zeros((len(tried), n)), np.zeros(n), change, precision)
+    shapes: Any = np.zeros((2, n, 2)) if strongest else (None, None)
+    left = Left(np.zeros((len(tried), n)), np.zeros(n), *shapes)
     call("describe_waveforms", _as_structure(sums, noise, 0.0), ctypes.c_int64(len(tried)), tried, *left)
     return left
 

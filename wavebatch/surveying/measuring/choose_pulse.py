@@ -484,7 +484,7 @@ def _save(shorter: Candidate, longer: Candidate) -> float:
 
 
 def _saves_little(shorter: Candidate, longer: Candidate) -> bool:
-    """Whether a candidate saves surely too little to be taken in place of another: more waveforms do not change that."""
+    """Whether a candidate surely saves too little to be taken in place of another: more waveforms change nothing."""
     error = np.std(shorter.length - longer.length) * np.sqrt(len(longer.length)) / max(longer.echoes, 1)
     return bool(_save(shorter, longer) + SURE * error < _need_saved(shorter, longer))
 
@@ -662,4 +662,4 @@ def _explain_between(
     part = explain(block.rows(rows), system)
     length, volume = (one.copy() for one in near.left[:2])
     length[:, rows], volume[rows] = describe_left(part.sums, sample_noise(system), changes)[:2]
-    return Looked(replace_rows(near.explained, rows, part), Left(length, volume, None, None))
+    return Looked(replace_rows(near.explained, rows, part), near.left._replace(length=length, volume=volume))
