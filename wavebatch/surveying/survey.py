@@ -295,9 +295,9 @@ def _survey(
             tail = (share for lag, share in system.tail_misfit if 0 < lag <= RINGING_REACH * system.sigma_ref)
             system = replace(system, ringing=max((share for share in tail if share >= LEAST_RINGING), default=0.0))
         # With the misfit that the change asks for whitened fits make no echoes of it, without it they keep close pairs:
-        # either will do, as the misfit is chosen after it.
+        # either will do, as the misfit is chosen after it: first the one that was looked at.
         borne = replace(borne, noise=system.noise)
-        tried = (system, borne)[: 1 + (borne.misfit > system.misfit)]
+        tried = (borne, system) if borne.misfit > system.misfit else (system,)
         noises = (choose_whitening(part, one, choice.best.change, looked).noise for one in tried)
         system = replace(system, noise=next((noise for noise in noises if noise.whitening), system.noise))
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)

@@ -11,7 +11,6 @@ At the end fits become echoes of the whole pulse, with errors (kernels/c/echoes.
 from __future__ import annotations
 
 import ctypes
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -317,12 +316,6 @@ def _as_problem(
 
 def as_pulse(shape: PulseShape) -> library.Pulse:
     """The pulse for the library; the structure holds the arrays to which it points."""
-    return _make_pulse(shape) if shape.table is None else _make_pulse.__wrapped__(shape)  # arrays have no hash
-
-
-@lru_cache(maxsize=8)
-def _make_pulse(shape: PulseShape) -> library.Pulse:
-    """As `as_pulse`; a decomposition and its description ask for the same one four times."""
     components = np.array(shape.components, np.float64).reshape(-1, 3)
     rows = (np.zeros(2, np.float32),) * 2 if shape.table is None else (shape.table.value, shape.table.slope)
     if not 2 <= len(rows[0]) == len(rows[1]):
