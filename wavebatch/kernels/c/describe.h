@@ -299,10 +299,9 @@ EXPORT int64_t describe_widths(int64_t n, const double *ratio, const double *err
             tried[i] = -log_double((1 - anywhere) * whole + anywhere / wider[uniform - 1]);
             if (known[i]) sum += tried[i];
         }
-        if (sum < least) {
-            least = sum;
-            memcpy(cost, tried, n * sizeof(double));
-        }
+        if (!(sum < least)) break; /* further ones serve worse still */
+        least = sum;
+        memcpy(cost, tried, n * sizeof(double));
     }
     for (int64_t i = 0; i < n; i++) cost[i] -= log_double(error[i] / ROOT_2PI_INVERSE);
     free(density); free(tried);
