@@ -7,7 +7,7 @@ header makes another sensor of it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -338,8 +338,10 @@ def _find_sides(rows: np.ndarray, right: tuple[float, float], *, chance: float) 
     slope = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), z, rcond=None)[0]
     light = rows[1] / np.maximum(down + (slope[0] * east + slope[1] * north) / rows[8], LEAST_FACING)
     across = (right[0] * east + right[1] * north) / rows[8]
-    both = across, np.abs(across)
-    return tuple(_find_fading(one, light, rows[2:4], chance=chance / 2, most=USUAL_SIDES) for one in both)
+    prior: Any = {"chance": chance / 2, "most": USUAL_SIDES}
+    found = (_find_fading(one, light, rows[2:4], **prior) for one in (across, np.abs(across)))
+    unseen = weigh_change(0.0, 10.0 * USUAL_SIDES, **prior)  # too few waveforms show nothing
+    return tuple(unseen if one is NO_CHANGE else one for one in found)
 
 
 def _find_right(time: np.ndarray, place: np.ndarray) -> tuple[tuple[float, float], float]:
