@@ -37,6 +37,11 @@ HAIR = 0.05
 """Noises from a whole count up to which a sample of the mirror is one. In noise of less than a count few patterns of
 counts are near a threshold, and a level .01 counts from a half put 57 that were found just below it in the mirror."""
 
+FINE, STEP = 0.45, 1.5
+"""Noise of quiet samples below which counts hardly change, and amplitude up to which an echo is one count high
+[counts]: a bell through a row of equal counts is up to 1.3 times as high. Slow noise only steps up where its level lies
+a quarter above a count. Such steps have no mirror, but all are one count high; of echoes as many are twice as high."""
+
 LACK = 0.3
 """Share of the echoes within ZONE that a hole must be deeper than: neighbours that are not told apart leave less."""
 
@@ -94,18 +99,25 @@ def look_in_mirror(
     unit, false = np.sqrt(SQRT_PI / block.spacing) / system.noise.std, []
     # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse. And their fits
     # have free levels: in short waveforms of wide pulses what known ones lack became wide echoes.
+    options, steps = SEARCH | {"free_levels": True}, [(np.empty(0), np.empty(0))]
     for detect in (matched_filter, maximum):
-        other = find_echoes(mirrored, system, detect, **SEARCH | {"free_levels": True})[2]
+        other = find_echoes(mirrored, system, detect, **options)[2]
         alone = np.ones(len(other), bool)
         alone[match_echoes(other, echoes, SAME * width).found] = False
         rest = other.take(np.flatnonzero(alone))
         energy = rest.amplitude * np.sqrt(rest.sigma) * unit
         beside, quiet = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
         false.append((energy[beside], energy[quiet]))
+        if system.noise.quiet < FINE:
+            own = find_echoes(block, system, detect, **options)[2]
+            energy = own.amplitude * np.sqrt(own.sigma) * unit
+            low = own.amplitude < STEP
+            steps.append((energy[low], energy[~low & (own.amplitude < 2 * STEP)]))
     energy = echoes.amplitude * np.sqrt(echoes.sigma) * unit
     for level in levels:
         most = [max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True)]
-        yield level, Mirror(len(mains), most[0], int(np.count_nonzero(energy >= level)), most[1])
+        made = max(int(np.count_nonzero(low >= level) - np.count_nonzero(high >= level)) for low, high in steps)
+        yield level, Mirror(len(mains), most[0], int(np.count_nonzero(energy >= level)), max(most[1], made))
 
 
 def count_holes(system: SystemPulse, explained: Explained, spacing: float) -> int:
