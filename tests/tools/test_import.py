@@ -260,6 +260,15 @@ def test_degrees_become_utm_and_standard_time_that_of_las(tmp_path):
     assert "32732" in facts.crs
 
 
+@pytest.mark.parametrize("offset", [-44e6, 2.1e8])
+def test_adjusted_times_stay_so(tmp_path, offset):
+    """Read as standard GPS time, a flight of 2010 or 2018 would be of before 1987."""
+    path = _make(tmp_path, [Pulse([[(2000, bell(40, 10, 90, 2))]], time=0)], (ECHO,), time=(1e-6, offset))
+    assert any("adjusted" in note for note in import_file(path, tmp_path / "o.las", ImportOptions()).notes)
+    facts, points, _ = _points(tmp_path / "o.las")
+    assert facts.header.global_encoding & 1 and points["gps_time"][0] == offset
+
+
 def test_geocentric_coordinates_stay_so(tmp_path):
     keys = struct.pack("<8H", 1, 1, 0, 1, 1024, 0, 1, 3)
     place = (4_201_000_000, 168_000_000, 1_780_000_000)

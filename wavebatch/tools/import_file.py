@@ -192,6 +192,8 @@ def import_file(
         notes.append(f"warning: its pulses use {used}, which may be that of another file: then its points are wrong")
     if plan.one_time:
         notes.append("all pulses have the same time; they get times 0.1 ms apart")
+    elif not plan.week and plan.time_offset == header.time_offset:
+        notes.append("times are taken as adjusted standard GPS time: as standard GPS time they are of before 2000")
     if plan.unknown:
         names = ", ".join(map(str, plan.unknown))
         notes.append(f"channel {names}: its gain over channel {plan.primary} is unknown; all of its segments are kept")
@@ -224,6 +226,9 @@ SAMPLED = 2 * MOST_STACKED
 """Pulses of the sample, about."""
 ONE_TIME = 64
 """Pulses of one time from which that is no time."""
+FIRST_STANDARD = 630_720_000.0
+"""Standard GPS time of 2000: PulseWaves does not say which time it has, and few waveforms were recorded before.
+Adjusted times reach it in 2031."""
 
 
 @frozen(eq=False)
@@ -319,8 +324,8 @@ def make_plan(reader: PulseReader) -> Plan:
             ratio = float((x[used] * y[used]).sum() / (y[used] ** 2).sum())
     ratios, unknown = ({}, others) if ratio <= 1 else ({others[0]: ratio}, ())
     noise = max(float(np.median(np.concatenate(steps))) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
-    latest = max(abs(time * header.time_scale + header.time_offset) for time in (first, last))
-    week = latest <= 2 * WEEK  # flights over the end of a week count on
+    latest = max((time * header.time_scale + header.time_offset for time in (first, last)), key=abs)
+    week = abs(latest) <= 2 * WEEK  # flights over the end of a week count on
     # A descriptor per kind of segment; where they are too many, one for several lengths.
     step = 1
     while True:
@@ -338,7 +343,8 @@ def make_plan(reader: PulseReader) -> Plan:
         digitizers[code] = Digitizer(index[wide], bits, length, spacing)
     return Plan(
         primary, overlap.top, ratios, unknown, noise, digitizers, _learn_outgoing(outgoing),
-        header.count >= ONE_TIME and first == last, week, header.time_offset - (0.0 if week else ADJUSTED),
+        header.count >= ONE_TIME and first == last, week,
+        header.time_offset - (ADJUSTED if latest >= FIRST_STANDARD else 0.0),
         intensity == 0,
     )  # fmt: skip
 

@@ -90,6 +90,10 @@ TOP_STEP, PILED, SMALL_PILE = 0.9, 2, 60
 """Share of the height of the highest FEW waveforms from which others are as high; how many more these are than those a
 step below; waveforms from which that is looked for. Heights of echoes thin out towards the highest ones."""
 
+CUT_PILE = 5
+"""How many times as many waveforms have the highest count as maximum as any count below it, where it cuts short pulses.
+Pulses of one height, sampled at any phase without noise, pile up 2.4 times at their top (widths of 1.3 samples)."""
+
 FLATTER, MIDDLE, LEAST_TOP, MOST_TOPS = 1.05, 0.6, 0.2, 1024
 """Flatness of the tops over that of all but the flattest lower ones, and of the wider half of the tops over that of the
 others, from which an amplifier clips them: 1.25 and 1.15 where those of echoes up to twice as high are cut. At most
@@ -314,14 +318,16 @@ def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
 def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
     """Count at which the digitizer clips: its maximum, or a maximum that many waveforms share on flat tops (H6)."""
     top = int(samples.max(initial=0))
-    if top == 0:
-        return None
+    if top == 0 or top == max_count:
+        return float(top) or None
     at_top = samples == top
-    flat = (at_top[:, 1:] & at_top[:, :-1]).any(axis=1)
-    if top == max_count:
-        return float(top)
-    reached = at_top.any(axis=1).sum()
-    return float(top) if flat.sum() >= max(3, 0.5 * reached) and reached >= 5 else None
+    flat = (at_top[:, 1:] & at_top[:, :-1]).any(axis=1).sum()
+    highest = samples.max(axis=1)
+    reached = np.count_nonzero(highest == top)
+    # Tops of short pulses have one sample: there no count of the tenth below holds as many maxima.
+    tenth = highest[(highest < top) & (highest >= top - (top - np.median(samples)) * (1 - TOP_STEP))]
+    piled = reached >= CUT_PILE * np.unique(tenth, return_counts=True)[1].max(initial=1)
+    return float(top) if flat >= max(3, (0.2 if piled else 0.5) * reached) and reached >= 5 else None
 
 
 def find_flat_tops(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
