@@ -333,9 +333,9 @@ def _find_sides(rows: np.ndarray, right: tuple[float, float], *, chance: float) 
 
     rows: as `_read_rows`. What a hillside does to light is taken off by the plane of the strip's ground.
     """
-    x, y, z, down = rows[2:6]
-    east, north = rows[2:4] - rows[6:8]
-    slope = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), z, rcond=None)[0]
+    down, (east, north) = rows[5], rows[2:4] - rows[6:8]
+    x, y, z = rows[2:5] - rows[2:5].mean(axis=1, keepdims=True)  # of coordinates with a zone nothing else is left
+    slope = np.linalg.lstsq(np.stack([x, y], axis=1), z, rcond=None)[0]
     light = rows[1] / np.maximum(down + (slope[0] * east + slope[1] * north) / rows[8], LEAST_FACING)
     across = (right[0] * east + right[1] * north) / rows[8]
     prior: Any = {"chance": chance / 2, "most": USUAL_SIDES}
