@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import refuses, run_command, succeed
 from facet_strips import EAST, NORTH, START, Facet, Sensor, path_of, write_strip
-from strips import true_sensor, write_positions
+from strips import place_header, true_sensor, write_positions
 
 import wavebatch as wb
 from wavebatch.core.errors import InputError
@@ -17,7 +17,7 @@ from wavebatch.core.trajectory import ADJUSTED, Trajectory
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
-from wavebatch.files.strip.reader import MOST_SLICES, RAYS_PER_SLICE, RaySample, StripReader, sample_rays
+from wavebatch.files.strip.reader import MOST_SLICES, RAYS_PER_SLICE, RaySample, StripReader, measure_scale, sample_rays
 from wavebatch.kernels.physics.radiometry import mean_haze
 from wavebatch.surveying.sensor import (
     UNKNOWN,
@@ -683,6 +683,15 @@ def test_heights_above_the_ground_are_refused_where_slopes_or_ranges_are_asked_f
     done = run_command("run", strip, "-o", tmp_path / "out", "--columns", f"+{shown}", "--profile", "fast")
     assert done.exit_code == code
     assert ("(class 2) have the height 0: heights count from the ground" in done.stderr) == (code > 0)
+
+
+@pytest.mark.parametrize(("step", "level"), [(0.01, True), (0.1, False)])
+def test_steps_of_heights_that_make_a_polder_level_are_no_normalisation(tmp_path, wide_strip, edit_points, step, level):
+    """Ground within .05 m of the sea was refused, where heights are stored in steps of .1 m."""
+    strip = edit_points(wide_strip, tmp_path / "s.las", Z=0)
+    place_header(strip, lambda fields: np.r_[fields[:2], step, fields[3:]])
+    with StripReader(strip) as reader, reader.scan() as scan:
+        assert measure_scale(reader, scan).level == level
 
 
 @pytest.mark.parametrize("wrong", ["vectors", "unit", ""])

@@ -355,7 +355,7 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
         raise InputError(
             f"{path}: most points of the ground (class 2) have the height 0: heights count from the ground, so slopes "
             "and ranges would be wrong: take the strip with its heights before they were normalised, or leave out the "
-            "stages that need slopes or ranges"
+            "stages that need slopes or ranges; where the ground is level at 0 (simulated), raise all heights"
         )
     if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
         raise InputError(

@@ -457,8 +457,9 @@ LEAST_PAIRS, SCALE_SPREAD, BENT = 20, 0.05, 0.1
 """Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles; and by
 how much, over their distance, returns of one pulse may be off its ray: their times may be rounded to samples."""
 
-GROUND = 2
-"""Class of points of the ground."""
+GROUND, FINE_HEIGHTS = 2, 0.01
+"""Class of points of the ground; and largest step of heights of which most are 0 by normalisation only: measured ground
+scatters by more, but in steps of .1 m a polder is level at 0."""
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """What steps through a strip have over a whole number, the next smaller one: those that are whole see one sensor only
@@ -580,7 +581,8 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
             ratios.append((apart / by_time)[good])
             bends.append((off / by_time)[good])
     ratio, height = np.concatenate(ratios), np.concatenate(heights)
-    zero = np.count_nonzero(np.abs(height) < 0.5 * abs(reader.facts.header.scales[2]))
+    step = abs(reader.facts.header.scales[2])
+    zero = np.count_nonzero(np.abs(height) < 0.5 * step) if step <= FINE_HEIGHTS else 0
     level = bool(len(height) >= LEAST_PAIRS and 2 * zero > len(height))
     if len(ratio) < LEAST_PAIRS:
         return PairScale(level=level)
