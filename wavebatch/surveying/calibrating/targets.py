@@ -382,8 +382,9 @@ def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None
     off = middle[0] / middle[1] - 1.0
     if abs(off) >= max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
         return float(off), abs(middle[0] - middle[1])  # over the median of all, which is the constant
-    inwards = np.argsort(depth)
-    for few in (LEAST_ECHOES // 2, 1):  # a target much smaller than its outline has one echo
+    inwards, oddest = np.argsort(depth), np.argmax(np.abs(constant - np.median(constant)))
+    # A target much smaller than its outline has one echo, which differs most: else it is one of many spots.
+    for few in (LEAST_ECHOES // 2, 1)[: 1 + (inwards[-1] == oddest)]:
         core = float(np.median(constant[inwards[-few:]]))
         off = float(np.median(constant)) / core - 1.0
         if abs(off) >= max(LEAST_CORE, EDGE_SIGMA * max(spreads) * MEDIAN_ERROR / few**0.5):
