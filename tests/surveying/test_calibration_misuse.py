@@ -492,16 +492,20 @@ def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fa
 
 
 @pytest.mark.parametrize("place", [0.0, 54e6], ids=["local", "with a zone"])
-def test_a_hillside_is_no_light_that_is_uneven_wherever_it_lies(rng, place):
-    """Of coordinates with the number of their zone the plane of the ground was lost: light "fell" by 12 %."""
-    x, y, slope = *rng.uniform((-200.0, 0.0), (200.0, 2000.0), (4000, 2)).T, 0.5
+@pytest.mark.parametrize("valley", [False, True])
+def test_a_hillside_or_a_valley_is_no_light_that_is_uneven(rng, place, valley):
+    """Light fell to both sides of a valley by 13 %; and to one side of a hill, of coordinates that have a zone."""
+    x, y = rng.uniform((-200.0, 0.0), (200.0, 2000.0), (4000, 2)).T
+    slope = 0.5 * (np.sign(x) if valley else np.ones(4000))
     away = np.stack([x, np.zeros(4000), slope * x - 700.0])
     distance = np.linalg.norm(away, axis=0)
     light = (slope * x - away[2]) / distance * rng.normal(1.0, 0.02, 4000)
     rows = np.stack([y, light, x + place, y + place, away[2], -away[2] / distance, np.full(4000, place), y + place,
                      distance])  # fmt: skip
-    sides = setting._find_sides(rows, (1.0, 0.0), chance=0.3)
-    assert [one.chance < 0.1 for one in sides] == [True, True]
+    assert all(one.chance < 0.1 for one in setting._find_sides(rows, (1.0, 0.0), chance=0.3))
+    rows[1] *= np.exp(0.0005 * np.abs(x) if valley else 0.0005 * x)
+    found = setting._find_sides(rows, (1.0, 0.0), chance=0.3)[valley]
+    assert found.shift == pytest.approx(0.05 if valley else 0.1, abs=0.02)
 
 
 @pytest.mark.parametrize("apart", [100.0, 5.0], ids=["lines", "one line"])

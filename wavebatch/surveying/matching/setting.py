@@ -94,8 +94,9 @@ FADING_PARTS, LEAST_OF_PART = 16, 50
 FEW_PARTS = 1.3
 """Factor of an error that so few parts tell, for surfaces that lie in no order."""
 
-LEAST_FACING = 0.1
-"""Least cosine by which light is divided: grazing rays tell nothing."""
+LEAST_FACING, LEAST_PLANE = 0.1, 1e-3
+"""Least cosine by which light is divided: grazing rays tell nothing; and least share of their extent that places have
+across their line, where they show a plane."""
 
 CELLS, LEAST_OF_CELL, LEAST_CELLS = (8, 32), 4, 50
 """Mean numbers of sampled waveforms of the cells in which light is compared with time; fewest of one that counts, and
@@ -331,12 +332,19 @@ def measure_setting(
 def _find_sides(rows: np.ndarray, right: tuple[float, float], *, chance: float) -> tuple[Change, ...]:
     """How light grows from one half of the swath to the other, and from its middle to both edges.
 
-    rows: as `_read_rows`. What a hillside does to light is taken off by the plane of the strip's ground.
+    rows: as `_read_rows`. What slopes do to light is taken off by a plane of the ground in each cell: over a valley
+    light falls to both sides.
     """
     down, (east, north) = rows[5], rows[2:4] - rows[6:8]
-    x, y, z = rows[2:5] - rows[2:5].mean(axis=1, keepdims=True)  # of coordinates with a zone nothing else is left
-    slope = np.linalg.lstsq(np.stack([x, y], axis=1), z, rcond=None)[0]
-    light = rows[1] / np.maximum(down + (slope[0] * east + slope[1] * north) / rows[8], LEAST_FACING)
+    *_, cell, count = cut_cells(rows[2:4], CELLS[1])
+    x, y, z = (one - (np.bincount(cell, one) / count)[cell] for one in rows[2:5])
+    xx, xy, yy, xz, yz = (np.bincount(cell, one * other) for one, other in ((x, x), (x, y), (y, y), (x, z), (y, z)))
+    known = xx * yy - xy * xy
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = np.stack([yy * xz - xy * yz, xx * yz - xy * xz]) / known
+    slopes[:, (count < LEAST_OF_CELL) | (known <= LEAST_PLANE * xx * yy)] = 0.0
+    tilt = slopes[0, cell] * east + slopes[1, cell] * north
+    light = rows[1] / np.maximum(down + tilt / rows[8], LEAST_FACING)
     across = (right[0] * east + right[1] * north) / rows[8]
     prior: Any = {"chance": chance / 2, "most": USUAL_SIDES}
     found = (_find_fading(one, light, rows[2:4], **prior) for one in (across, np.abs(across)))
