@@ -27,7 +27,8 @@ from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.tools.compare_chains import Contender, FitQuality, find_contender, match_sides, measure_fit
 from wavebatch.tools.pairing import Differences, compare_clouds, compare_truth
 from wavebatch.tools.sheets.sheet import format_csv
-from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
+from wavebatch.tools.simulate import PULSES, SCENES, Recording, StripOptions, TruthReader, simulate_strip
+from wavebatch.tools.simulate.render import paint_echoes
 
 CORNER = np.array([500_000.0, 5_400_000.0, 0.0])
 
@@ -159,6 +160,20 @@ def test_errors_against_truth_are_in_units_of_the_bound(strip):
         assert isolated[name].rms_per_bound == pytest.approx(1.0, abs=0.05)
         assert isolated[name].calibration == pytest.approx(1.0, abs=0.05)
         assert abs(isolated[name].bias) < 0.1 * isolated[name].rmse
+
+
+def test_true_widths_are_of_all_lobes(tmp_path):
+    """`run` gives full widths; that of the main lobe alone made right ones 10 errors off."""
+    scene = replace(SCENES["flat"], recording=Recording(pulse=PULSES["leica"]))
+    simulate_strip(scene, tmp_path / "s.las", pulses=300, seed=3, truth=tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as truth:
+        n, recording = len(truth["sigma"]), Recording(n_samples=4000, spacing=0.02, pulse=PULSES["leica"])
+        y = paint_echoes(recording, n, np.arange(n), np.full(n, 40.0), np.ones(n), truth["sigma"].astype(float))
+        width = (0.02 * np.count_nonzero(y > 0.5 * y.max(axis=1)[:, None], axis=1)).astype("f4")
+        xyz = np.stack([truth[k] for k in "xyz"], axis=1)
+        write_cloud(tmp_path / "a.las", truth["gps_time"], xyz, echo_width=width)
+    found = compare_truth(tmp_path / "a.las", tmp_path / "t.npz").differences["echo_width"]
+    assert found.number == n and width.min() > 7.6 and found.rms < 0.02
 
 
 def test_vendor_returns_against_truth_and_against_the_result(strip):

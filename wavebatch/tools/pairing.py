@@ -30,6 +30,7 @@ from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
 from wavebatch.tools.return_stats import pulses_told_apart
+from wavebatch.tools.simulate.render import full_sigma
 from wavebatch.tools.simulate.strip import TruthReader
 
 ClassCounts = dict[str, tuple[int, int]]
@@ -150,7 +151,11 @@ def compare_truth(
                 rows["xyz"] = np.stack([piece[name] for name in "xyz"], axis=1)
                 for name in ("gps_time", "amplitude", "flags", "isolated"):
                     rows[name] = piece[name]
-                rows["echo_time"], rows["echo_width"] = piece["time"], piece["sigma"] * FWHM_PER_SIGMA
+                # The truth has the main lobe's width; a target never narrows a pulse.
+                sigma, pulse = piece["sigma"].astype(np.float64), reference.pulse
+                whole = (sigma > 0.25 * pulse.sigma) & (sigma < 25 * pulse.sigma)
+                sigma[whole] = full_sigma(pulse, sigma[whole])
+                rows["echo_time"], rows["echo_width"] = piece["time"], sigma * FWHM_PER_SIGMA
                 task.add(1, rows)
             for piece in reference.read_pieces("packet_gps_time"):
                 task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))

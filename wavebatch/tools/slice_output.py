@@ -44,8 +44,9 @@ def write_cube(
     values f4 (lines, pulses, times): samples above the level without signal [DN], NaN where nothing was recorded.
     time f8 (times,): two-way [ns], from the plane across the mean ray through the sample nearest to the sensor.
     offset f4 (lines, pulses): to add to the times of a pulse [ns], within half a sample: samples are moved, not
-    interpolated. line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no pulse at
-    that scan angle. Raises InputError without a line, and where lines differ in their spacing.
+    interpolated. line i8 (lines,), and gps_time, origin (place of the first recorded sample), direction of each
+    pulse; NaN where a line has no pulse at that scan angle. Raises InputError without a line, and where lines differ in
+    their spacing.
     """
     if not lines:
         raise InputError(f"{target}: not written, because there is no scan line")

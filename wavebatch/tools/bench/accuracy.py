@@ -18,13 +18,12 @@ from wavebatch.core.echoes import UNCLEAN, EchoTable, without_nan
 from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.signal.runs import lobe_edges
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated_echoes, list_pairs, match_echoes
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools.simulate import Scene, simulate_blocks
-from wavebatch.tools.simulate.render import PulseModel, Recording, main_lobe, paint_echoes, spread_lobes
+from wavebatch.tools.simulate.render import Recording, full_sigma, paint_echoes
 
 NOTHING = float("nan")
 
@@ -130,7 +129,6 @@ def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | N
     return min(good, key=lambda row: (row["kernels"]["median"], row["name"]), default=None)
 
 
-_GRID = 49
 _STEP = 0.02
 """Step of the numeric derivatives, in widths of the system pulse."""
 
@@ -160,7 +158,7 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     later, earlier = (paint(truth.time + away, amplitude, sigma) for away in (step, -step))
     by_time = (later - earlier) / (2 * step)
     wider, narrower = sigma + step, sigma - step
-    grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
+    grown = full_sigma(recording.pulse, wider) - full_sigma(recording.pulse, narrower)
     broad, sharp = (paint(truth.time, amplitude, width) for width in (wider, narrower))
     by_sigma = (broad - sharp) / np.maximum(grown, 1e-9)[:, None]
     columns = np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64)
@@ -191,25 +189,6 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
         error = np.sqrt(np.where(known, variance, 1.0)) / np.where(scale > 0, scale, 1.0)
         bounds[rows] = np.where(known, error, np.inf).reshape(len(rows), k, 3)
     return bounds
-
-
-def _measure(pulse: PulseModel, sigma: np.ndarray) -> np.ndarray:
-    """Full width at half maximum over 2.354820 of true echoes [ns], (m,)."""
-    if not pulse.lobes:
-        skew = abs(pulse.kappa)
-        wider = 2 * np.sinh(skew * FWHM_PER_SIGMA / 2) / (skew * FWHM_PER_SIGMA) if skew > 1e-6 else 1.0
-        return sigma * wider
-    if not len(sigma):
-        return sigma
-    grid = np.linspace(sigma.min(), max(sigma.max(), 1.001 * sigma.min()), _GRID)
-    step = grid[0] / 100
-    x = np.arange(-int(4 * grid[-1] / step), int(6 * grid[-1] / step))[:, None] * step
-    ones = np.ones(_GRID)
-    total = np.zeros((len(x), _GRID))
-    for number, (start, height, width) in enumerate(spread_lobes(pulse, 0 * ones, ones, grid)):
-        total += height * main_lobe((x - start) / width, pulse.kappa if number == 0 else 0.0)
-    edges = np.array([lobe_edges(x[:, 0], curve, 0.5 * curve.max()) for curve in total.T])
-    return np.interp(sigma, grid, np.diff(edges, axis=1)[:, 0] / FWHM_PER_SIGMA)
 
 
 CLEAR = 10.0
@@ -279,7 +258,7 @@ def make_group(
     has, as sigma, the full width at half maximum over 2.354820. For a Gaussian they are equal.
     """
     recording = scene.recording
-    sigma = _measure(recording.pulse, truth.sigma.astype(np.float64))
+    sigma = full_sigma(recording.pulse, truth.sigma.astype(np.float64))
     return Group(
         number=number,
         block=block,

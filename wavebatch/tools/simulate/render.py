@@ -16,10 +16,11 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, check_options, option
-from wavebatch.core.units import AIR_SPEED, QUANTISATION_STD
+from wavebatch.core.units import AIR_SPEED, FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.strip.packets import MAX_SAMPLES
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
+from wavebatch.kernels.signal.runs import lobe_edges
 
 EAST, NORTH, GROUND = 500_000.0, 5_400_000.0, 120.0
 """South-west corner and height of the simulated land [m], UTM zone 32 north."""
@@ -246,6 +247,25 @@ def _paint(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray
     for share, delay, width, scale in _widen(pulse, sigma):
         total = total + share * scale * np.exp(-0.5 * ((x[:, None] - delay) / width) ** 2)
     return x, total
+
+
+def full_sigma(pulse: PulseModel, sigma: np.ndarray) -> np.ndarray:
+    """Full width at half maximum over 2.354820 of true echoes of all lobes [ns], (m,); sigma: of the main lobe."""
+    if not pulse.lobes:
+        skew = abs(pulse.kappa)
+        wider = 2 * np.sinh(skew * FWHM_PER_SIGMA / 2) / (skew * FWHM_PER_SIGMA) if skew > 1e-6 else 1.0
+        return sigma * wider
+    if not len(sigma):
+        return sigma
+    grid = np.linspace(sigma.min(), max(sigma.max(), 1.001 * sigma.min()), 49)
+    step = grid[0] / 100
+    x = np.arange(-int(4 * grid[-1] / step), int(6 * grid[-1] / step))[:, None] * step
+    ones = np.ones(len(grid))
+    total = np.zeros((len(x), len(grid)))
+    for number, (start, height, width) in enumerate(spread_lobes(pulse, 0 * ones, ones, grid)):
+        total += height * main_lobe((x - start) / width, pulse.kappa if number == 0 else 0.0)
+    edges = np.array([lobe_edges(x[:, 0], curve, 0.5 * curve.max()) for curve in total.T])
+    return np.interp(sigma, grid, np.diff(edges, axis=1)[:, 0] / FWHM_PER_SIGMA)
 
 
 def main_lobe(z: np.ndarray, kappa: float) -> np.ndarray:

@@ -32,7 +32,7 @@ from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, build_dtype, fi
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.stages.score import find_isolated_echoes
-from wavebatch.tools.simulate.render import EAST, NORTH
+from wavebatch.tools.simulate.render import EAST, LEAST_SIGMA, NORTH, PulseModel
 from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, fill_packets, list_returns
 from wavebatch.tools.simulate.scenes import Scene, Simulated, find_scene, seed_block, simulate_seed_block
 
@@ -87,6 +87,12 @@ class TruthReader(Closing):
                 value = self.meta[key]
                 if type(value) not in (int, float) or not least <= value <= most:
                     raise ValueError(f"{key} of its description is {str(value)[:40]}")
+            shape = self.meta["recording"]["pulse"]
+            lobes = tuple((float(share), float(later), float(width)) for share, later, width in shape["lobes"])
+            self.pulse = PulseModel(float(shape["sigma"]), float(shape["kappa"]), lobes)
+            lobes = ((self.pulse.kappa, 0.0, self.pulse.sigma), *lobes)
+            if not all(abs(h) <= 0.5 and abs(t) <= 1e4 and LEAST_SIGMA <= width <= 1e4 for h, t, width in lobes):
+                raise ValueError(f"pulse of its description is {str(shape)[:40]}")
 
     def close(self) -> None:
         """Closes the file."""
