@@ -512,9 +512,10 @@ def find_warnings(
     seen = unseen + report.count("matched_returns") + report.count("unmatched_returns")
     if echoes and seen >= LEAST_JUDGED and unseen > (1.0 - LEAST_MATCHED) * seen:
         line = (
-            f"{unseen} of {seen} returns with an intensity have packets without an echo: the noise of "
-            f"{prepared.system.noise.std:.3g} DN is too high, where packets are too short to show it beside their "
-            "echoes, or the threshold of the chain is; give --system, a survey of a longer strip of this sensor"
+            f"{unseen} of {seen} returns with an intensity have packets without an echo: they are too weak, or those "
+            f"of another channel, or the noise of {prepared.system.noise.std:.3g} DN is too high, as where packets are "
+            "too short to show it beside their echoes, or the threshold of the chain is; draw some with `wavebatch "
+            "plot waveform`, or give --system, a survey of a longer strip of this sensor"
         )
         found += warn("noise-guess", [line])
     found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()
