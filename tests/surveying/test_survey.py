@@ -15,7 +15,7 @@ from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
-from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
+from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK, find_saturation
 from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample
 from wavebatch.surveying.systems import known_systems as module
 from wavebatch.surveying.systems.figures import Figures
@@ -87,6 +87,13 @@ def test_tops_of_short_pulses_that_are_cut_are_seen(saturation):
     """Half of them have one sample only; where they were missed, a quarter of the echoes was false."""
     survey = survey_block(make_block(make_scene("village", saturation=saturation), 3000, seed=3)[0])
     assert survey.system.saturation == saturation and survey.figures.overlapped_share < 0.01
+
+
+def test_weak_pulses_of_one_height_are_not_cut(rng):
+    """Of 5 counts and hardly any noise, they have one count as maximum, with no other one to compare it with."""
+    off = np.arange(60) - 30 - rng.uniform(-0.5, 0.5, (400, 1))
+    samples = np.rint(10 + 5 * np.exp(-0.5 * (off / 1.5) ** 2) + 0.1 * rng.standard_normal((400, 60)))
+    assert find_saturation(samples.astype(np.int64), 255) is None
 
 
 def test_the_range_of_counts_is_the_recorded_one_though_a_pattern_is_taken_off():

@@ -90,8 +90,9 @@ TOP_STEP, PILED, SMALL_PILE = 0.9, 2, 60
 """Share of the height of the highest FEW waveforms from which others are as high; how many more these are than those a
 step below; waveforms from which that is looked for. Heights of echoes thin out towards the highest ones."""
 
-CUT_PILE = 5
-"""How many times as many waveforms have the highest count as maximum as any count below it, where it cuts short pulses.
+CUT_PILE, LEAST_TENTH = 5, 3.0
+"""How many times as many waveforms have the highest count as maximum as any count below it, where it cuts short pulses,
+and counts there must be: without noise weak pulses of one height have hardly another maximum than one count.
 Pulses of one height, sampled at any phase without noise, pile up 2.4 times at their top (widths of 1.3 samples)."""
 
 FLATTER, MIDDLE, LEAST_TOP, MOST_TOPS = 1.05, 0.6, 0.2, 1024
@@ -325,8 +326,9 @@ def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
     highest = samples.max(axis=1)
     reached = np.count_nonzero(highest == top)
     # Tops of short pulses have one sample: there no count of the tenth below holds as many maxima.
-    tenth = highest[(highest < top) & (highest >= top - (top - np.median(samples)) * (1 - TOP_STEP))]
-    piled = reached >= CUT_PILE * np.unique(tenth, return_counts=True)[1].max(initial=1)
+    tenth = (top - np.median(samples)) * (1 - TOP_STEP)
+    below = highest[(highest < top) & (highest >= top - tenth)]
+    piled = tenth >= LEAST_TENTH and reached >= CUT_PILE * np.unique(below, return_counts=True)[1].max(initial=1)
     return float(top) if flat >= max(3, (0.2 if piled else 0.5) * reached) and reached >= 5 else None
 
 
