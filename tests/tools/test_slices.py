@@ -64,8 +64,13 @@ def test_lines_do_not_depend_on_units_and_samples_are_those_of_the_strip(strip):
     assert np.diff(first) == pytest.approx(np.diff(block.samples[0].astype(float)))
 
 
-def test_long_lines_are_cut_and_short_ones_left_out(strip):
+def test_long_lines_are_cut_and_short_ones_left_out(strip, monkeypatch):
     assert max(len(line) for line in read_all(strip, most=300)) == 300
+    with monkeypatch.context() as patch:  # so that long waveforms need no more memory
+        patch.setattr("wavebatch.tools.scan_slices.MOST_SAMPLES", 16_000)
+        lines = read_all(strip)
+    assert 15_000 < max(len(line.value) for line in lines) <= 16_000
+    assert sum(map(len, lines)) == sum(map(len, read_all(strip)))
     assert min(len(line) for line in read_all(strip, most=300, least=250)) >= 250
 
 

@@ -28,6 +28,8 @@ LEAST_PULSES = 8
 """Shorter lines are left out: they hold no surface to find."""
 MOST_PULSES = 16_384
 """Longer lines are cut: without a moving mirror, a strip would be one line and memory would not be bounded."""
+MOST_SAMPLES = 1 << 23
+"""Lines of more samples are cut, too: a slice takes up to 100 bytes for each."""
 _BLOCK = 4096
 _SAME_RAY = 1e-4
 """Largest relative difference of the directions of two waveforms of one pulse: they are in single precision. Pulses
@@ -114,7 +116,8 @@ def read_scan_lines(
         angle = np.arcsin(np.clip(flat @ axis / length, -1, 1))
         edges = np.append(find_sweeps(angle, pulses["gps_time"]), len(pulses))
         # Lines that are too long are cut.
-        pieces = [np.arange(a, b, most) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        step = min(most, max(least, MOST_SAMPLES // int(pulses["count"].max())))
+        pieces = [np.arange(a, b, step) for a, b in zip(edges[:-1], edges[1:], strict=True)]
         edges = np.concatenate([*pieces, edges[-1:]])
         last = unit.number == reader.unit_count() - 1
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
