@@ -143,10 +143,10 @@ def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):
     assert np.mean(found) == pytest.approx(gain, rel=0.15)
 
 
-@pytest.mark.quick_cases("3.5-0.18")
-@pytest.mark.parametrize(("width", "least"), [(1.2, 0.15), (2.0, 0.18), (3.5, 0.18)])
+@pytest.mark.quick_cases("0.8-0.15")
+@pytest.mark.parametrize(("width", "least"), [(0.8, 0.15), (1.2, 0.15), (2.0, 0.18), (3.5, 0.18)])
 def test_noise_that_grows_most_where_the_fit_takes_most_is_put_back(rng, width, least):
-    """In the middle of narrow echoes; 0.12 to 0.18 was found where 0.2 is true."""
+    """In the middle of narrow echoes; 0.12 to 0.18 was found where 0.2 is true, and none with pulses of two samples."""
     n, x = 4096, np.arange(80)
     light = 2 * rng.uniform(20, 80, (n, 1)) * np.exp(-0.5 * ((x - rng.uniform(15, 65, (n, 1))) / width) ** 2)
     samples = np.rint(100 + light + rng.standard_normal((n, 80)) * np.sqrt(4 + 0.2 * light))

@@ -31,6 +31,7 @@ from wavebatch.surveying.measuring.misfit import (
     limit_faint,
     measure_beside,
     measure_tail,
+    raise_misfit,
     share_fixed,
     share_repeated,
     suspect_pairs,
@@ -311,8 +312,9 @@ def _survey(
             system = replace(system, misfit=misfit)
             echoes = decompose_sample(part, system)
         # Neither the description nor what fits leave shows a shape that changes, where two echoes describe it as well.
-        if choice.best.change and suspect_pairs(echoes, system.sigma_ref):
-            system = replace(system, misfit=bear(system, choice.best.change).misfit)
+        most = bear(system, choice.best.change).misfit if choice.best.change else 0.0
+        while system.misfit < most and suspect_pairs(echoes, system.sigma_ref):
+            system = raise_misfit(system, most)
             echoes = decompose_sample(part, system)
         repeated_share = share_repeated(echoes, system.sigma_ref)
         if repeated_share > MOST_DOUBTED:

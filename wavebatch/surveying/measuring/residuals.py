@@ -32,9 +32,9 @@ GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
 """Widths of an echo around it in which the growth of noise is looked for, steps of the lag there, and the echoes of a
 class of heights: misfit of the pulse is taken off by lag and class."""
 
-BROUGHT, BROUGHT_CROSS = np.sqrt(2 / 3) * np.array([1, 2 / 3, 1 / 2]), -np.sqrt(2 / 3) / 3
-"""Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first
-and the third one, times 2 / sqrt(2) as it enters the sum."""
+FITTED, MOST_TAKEN = 4.0, 0.97
+"""Widths around an echo whose samples its fit takes its values from; and share of a sample's variance that a fit may
+take: what is left of more says nothing."""
 
 FINE = np.array([70, -56, 28, -8, 1]) / np.sqrt(12_870)
 """Half of a filter that takes eighth differences, and leaves white noise as large as it is."""
@@ -46,8 +46,8 @@ of them, so that those that stay single do not show it."""
 LEAST_FINE = 0.2
 """Share of the noise's variance in eighth differences, at least, from which photons are known by these."""
 
-ENOUGH_TO_GROW, ENOUGH_FINE, MOST_FINE = 2000, 500, 1024
-"""Samples in which a growth is looked for, and in which one of MANIFOLD shows; and echoes that are asked for it."""
+ENOUGH_TO_GROW, MOST_FINE = 500, 1024
+"""Samples in which a growth is looked for; and echoes that are asked for one of MANIFOLD."""
 
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
@@ -188,7 +188,7 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     sample = kinds["quiet"] or std
     coloured = std > COLOURED * sample
     steep = bool(2 * system.noise.gain * quantile(alone.amplitude, 0.9) > MANIFOLD * std**2) and not coloured
-    gain = _noise_gain(residual, model, lag, width, std, coloured, steep=steep)
+    gain = _noise_gain(residual, model, lag, std, coloured, steep=steep, fitted=True)
     return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=gain))
 
 
@@ -210,9 +210,9 @@ def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     residual = np.nan_to_num(subtract_echoes(part, system, replace(echoes, waveform=rows), model))
     fine, signal = (filter_symmetric(one.T, taps).T for one, taps in ((residual, FINE), (model, FINE**2)))
     lag = (np.arange(model.shape[1]) - echoes.time[:, None] / block.spacing) / (echoes.sigma[:, None] / block.spacing)
-    # Of an endless width: the fit takes away nothing of such differences.
     std = noise.quiet * np.sqrt(left)
-    gain = _noise_gain(fine, signal, lag, np.full(len(rows), np.inf), std, False, steep=True) * (noise.std / std) ** 2
+    # The fit takes away nothing of such differences.
+    gain = _noise_gain(fine, signal, lag, std, False, steep=True, fitted=False) * (noise.std / std) ** 2
     return gain if gain * quantile(echoes.amplitude, 0.9) > MANIFOLD * noise.std**2 else 0.0
 
 
@@ -280,23 +280,41 @@ def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...])
     return best, least
 
 
+def _find_leverage(lag: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Share h_ii of each sample's variance that a fit of amplitude, time and width takes away (n, s), and the sum of
+    h_ij^2 S_j that it brings there of a variance S_j, the signal (n, s).
+
+    The three derivatives of a Gaussian, made orthogonal over its samples: h_ij is the sum of their products.
+    """
+    row, column = np.nonzero(np.abs(lag) < FITTED)
+    z = lag[row, column].astype(np.float64)
+    basis: list[np.ndarray] = []
+    for power in range(3):
+        values = z**power * exp(-0.5 * z * z)
+        for one in basis:
+            values = values - one * np.bincount(row, one * values)[row]
+        basis.append(values / np.sqrt(np.maximum(np.bincount(row, values * values), 1e-9))[row])
+    taken, brought = np.zeros((2, *lag.shape))
+    height = signal[row, column].astype(np.float64)
+    for i, one in enumerate(basis):
+        taken[row, column] += one * one
+        for j, other in enumerate(basis[: i + 1]):
+            product = one * other
+            brought[row, column] += (1 if i == j else 2) * product * np.bincount(row, product * height)[row]
+    return taken, brought
+
+
 def _noise_gain(
-    residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool,
-    *, steep: bool,
+    residual: np.ndarray, model: np.ndarray, lag: np.ndarray, std: float, coloured: bool, *, steep: bool, fitted: bool
 ) -> float:
-    """Growth of the variance per count of signal, 0 where it could be chance (H12); steep: if it is one of MANIFOLD."""
+    """Growth of the variance per count of signal, 0 where it could be chance (H12).
+
+    lag: after the echo's centre, in widths. steep: if it is one of MANIFOLD. fitted: residuals are those of fits.
+    """
     core = np.abs(lag) < GROWTH_REACH
-    # Share h of a sample's variance that the fit of amplitude, time and width takes away, and what it brings there of a
-    # variance that is the pulse itself, of height 1: the sum of h_ij^2 S_j over the samples j.
-    # lag: after the echo's centre, in widths. width: of the echo [samples]. The three derivatives of a Gaussian span
-    # the first three Hermite functions: their products add up to h_ij, times the width.
-    z = lag[core].astype(np.float64) ** 2
-    # Squares of the three, and the product of the first and the last one, over exp(-z^2) / sqrt(pi).
-    squares = np.ones_like(z), 2 * z, 0.5 * (2 * z - 1) ** 2
-    bell = exp(-z) / np.sqrt(np.pi) / np.broadcast_to(width[:, None], lag.shape)[core]
-    brought = sum(part * share for part, share in zip(squares, BROUGHT, strict=True)) + (2 * z - 1) * BROUGHT_CROSS
-    taken = np.minimum(bell * sum(squares), 0.9)
-    brought = bell * brought
+    taken, brought = _find_leverage(lag, model) if fitted else np.zeros((2, *lag.shape))
+    core &= taken < MOST_TAKEN
+    taken, brought = taken[core], brought[core]
     # Residuals at `core` (mask) less what all echoes of about one height leave at one lag (k,).
     # That part changes with the height where a receiver compresses, and would look like noise that grows with the
     # signal: one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
@@ -305,8 +323,8 @@ def _noise_gain(
     common, number, _ = find_common(values, lag[core], height, GROWTH_REACH)
     squared = ((values - common) * np.sqrt(number / np.maximum(number - 1, 1))) ** 2 / (1 - taken)
     # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
-    signal = (model[core].astype(np.float64) * (1 - 2 * taken) + height * brought) / (1 - taken)
-    if len(signal) < (ENOUGH_FINE if steep else ENOUGH_TO_GROW):
+    signal = (model[core].astype(np.float64) * (1 - 2 * taken) + brought) / (1 - taken)
+    if len(signal) < ENOUGH_TO_GROW:
         return 0.0
     edges = quantiles(signal, np.linspace(0, 1, 13))
     place = np.clip(np.searchsorted(edges, signal) - 1, 0, 11)
