@@ -685,6 +685,16 @@ def test_heights_above_the_ground_are_refused_where_slopes_or_ranges_are_asked_f
     assert ("(class 2) have the height 0: heights count from the ground" in done.stderr) == (code > 0)
 
 
+def test_ground_that_is_level_at_0_is_no_normalised_strip(tmp_path, edit_points):
+    """Its rays meet. Simulated towns and fields stand at 0, and were refused."""
+    succeed("simulate", "flat", "-o", tmp_path / "in.las", "--pulses", "3000", "-q")
+    strip = edit_points(tmp_path / "in.las", tmp_path / "s.las", Z=0)
+    place_header(strip, lambda fields: np.r_[fields[:5], 0.0, fields[6:]])
+    with StripReader(strip) as reader, reader.scan() as scan:
+        assert measure_scale(reader, scan).level
+        assert find_sensor(reader, scan, SensorRequest()).kind == "direction vectors"
+
+
 @pytest.mark.parametrize(("step", "level"), [(0.01, True), (0.1, False)])
 def test_steps_of_heights_that_make_a_polder_level_are_no_normalisation(tmp_path, wide_strip, edit_points, step, level):
     """Ground within .05 m of the sea was refused, where heights are stored in steps of .1 m."""

@@ -100,6 +100,10 @@ LARGEST_MISS, MOST_MISS = 0.01, 0.1
 """Distance by which a ray misses the path, over its length, and share of such rays, from which they do not meet: the
 path of two sensors with the same times is half way between them. Those of real sensors miss it by a thousandth."""
 
+LEVEL = 30
+"""Steps of coordinates by which rays may miss their meeting place over ground that is level at 0: rounding and noise of
+returns make some, heights that were taken off make hundreds."""
+
 LEAST_AGREEING = 20
 """Fewest rays of other digitizers that must agree with a trajectory, each after a ray that does not, for vectors to be
 wrong and not the trajectory."""
@@ -351,11 +355,14 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
             f"{path}: coordinates look like degrees, since all points lie within one unit, and no CRS says so: {remedy}"
         )
     scale, *_, level = measure_scale(reader, scan)
-    if level:
+    found = estimate_path(sample_rays(reader, scan)[0], "direction vectors") if level else None
+    residual = np.radians(dict(found.facts)["residual_deg"]) * found.distance if found and found.distance else np.inf
+    # Heights that were taken off move rays, which meet no more; over ground that is level at 0 they do.
+    if level and residual > LEVEL * max(np.abs(reader.facts.header.scales)):
         raise InputError(
             f"{path}: most points of the ground (class 2) have the height 0: heights count from the ground, so slopes "
             "and ranges would be wrong: take the strip with its heights before they were normalised, or leave out the "
-            "stages that need slopes or ranges; where the ground is level at 0 (simulated), raise all heights"
+            "stages that need slopes or ranges; where the ground is level at 0 indeed, raise all heights"
         )
     if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
         raise InputError(
