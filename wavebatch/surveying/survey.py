@@ -25,13 +25,13 @@ from wavebatch.surveying.measuring.misfit import (
     LEAST_MISFIT,
     MISFIT_PEAK,
     MOST_FAINT,
+    STEP_OF_MISFITS,
     cover_fits,
     cover_repeated,
     find_parts,
     limit_faint,
     measure_beside,
     measure_tail,
-    raise_misfit,
     share_fixed,
     share_repeated,
     suspect_pairs,
@@ -314,7 +314,7 @@ def _survey(
         # Neither the description nor what fits leave shows a shape that changes, where two echoes describe it as well.
         most = bear(system, choice.best.change).misfit if choice.best.change else 0.0
         while system.misfit < most and suspect_pairs(echoes, system.sigma_ref):
-            system = raise_misfit(system, most)
+            system = replace(system, misfit=min(max(STEP_OF_MISFITS * system.misfit, LEAST_MISFIT), most))
             echoes = decompose_sample(part, system)
         repeated_share = share_repeated(echoes, system.sigma_ref)
         if repeated_share > MOST_DOUBTED:

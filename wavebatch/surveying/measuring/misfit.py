@@ -261,14 +261,9 @@ def cover_repeated(
     while share_repeated(found, system.sigma_ref) > MOST_REPEATED:
         if higher.misfit >= MOST_LACKED:
             return system, echoes
-        higher = raise_misfit(higher, MOST_LACKED, STEP_OF_MISFITS**2)
+        higher = replace(higher, misfit=min(max(STEP_OF_MISFITS**2 * higher.misfit, LEAST_MISFIT), MOST_LACKED))
         found = decompose_sample(block, higher)
     return higher, found
-
-
-def raise_misfit(system: SystemPulse, most: float, step: float = STEP_OF_MISFITS) -> SystemPulse:
-    """The system with `step` times its misfit, LEAST_MISFIT at least and `most` at most."""
-    return replace(system, misfit=min(max(step * system.misfit, LEAST_MISFIT), most))
 
 
 def share_repeated(echoes: EchoTable, width: float) -> float:
