@@ -563,6 +563,12 @@ def settle(
     best = max(tried, key=lambda one: one[1].worth)
     first = tried[0][1]
     found, mirror = best if best[1].worth - first.worth > GAINED * first.echoes else tried[0]
+    # White noise has so many peaks in all waveforms together, twice as many with free widths, of which exp(-u^2 / 2)
+    # are above u. The mirror of a few long waveforms does not show them.
+    peaks = np.count_nonzero(explained.sums.used) * part.spacing / (np.sqrt(2) * np.pi * system.sigma_ref)
+    least = float(np.sqrt(2 * log(max(peaks / (FALSE_QUIET * max(len(explained.echoes), 1)), 1.0))))
+    if least > max(SIGNIFICANCE, found.significance):
+        found = replace(found, significance=least)
     return found, replace(mirror, quiet=max(mirror.quiet, count_holes(system, explained, part.spacing))), doubt
 
 
