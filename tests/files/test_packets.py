@@ -492,8 +492,32 @@ def test_odd_lengths_are_used_as_stored_and_said(tmp_path, factor):
     # Yellowscan's are 3.5 % short.
     said = "times c/2 long (usual: 0.96 to 1.00), as unit vectors are"
     assert said in scan.warnings[0] if factor != 0.965 else scan.warnings == ()
+    assert list(scan.doubts.values()) == ["units"] * (factor != 0.965)
     direction = next(iter(read_all(path).values()))[3]
     np.testing.assert_allclose(direction, -1000 * TOWARD * factor, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("spacing", "said"), [(1, "0.001 ns apart"), (250, ""), (10**6, "1000 ns apart")])
+def test_a_spacing_in_another_unit_than_picoseconds_is_said(tmp_path, spacing, said):
+    raw = make_raw()
+    raw.vlrs = [descriptor(1, samples=32, spacing=spacing)]
+    doubts = scan_of(raw.write(tmp_path / "a.las")).doubts
+    assert list(doubts.values()) == ["units"] * bool(said) and all(said in line for line in doubts)
+
+
+@pytest.mark.parametrize("time", [0.0, np.nan, 7.0, None])
+def test_packets_of_one_ray_that_no_time_ties_are_said(tmp_path, time):
+    """With a packet for each return, each echo was written once per packet, in silence."""
+    raw = make_raw(200)
+    raw.packets *= 3
+    size, number = len(raw.packets) // 3, raw.points["bit_fields"].astype(np.uint64) - np.uint64(1)
+    raw.points["wavepacket_offset"] += number * np.uint64(size)
+    if time is not None:
+        raw.points["gps_time"] = time
+    doubts = scan_of(raw.write(tmp_path / "a.las")).doubts
+    assert list(doubts.values()) == ["repeated"] * (time is not None)
+    copies = np.count_nonzero(number[: -64])
+    assert time is None or next(iter(doubts)).startswith(f"{copies} of {len(number) - 64} points that were looked at")
 
 
 @pytest.mark.parametrize("most_returns", [1, 3])

@@ -80,6 +80,20 @@ def test_packet_vectors_in_metres_do_not_place_echoes_in_feet(named, tmp_path):
     _print("run", tmp_path / "strip.las", "-o", tmp_path / "o", "--profile", "fast", "--points", "returns")
 
 
+def test_times_in_nanoseconds_in_place_of_picoseconds_are_said(tmp_path, edit_points):
+    """Widths were 1000 times too small and added echoes lay on their neighbours, in silence."""
+    simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)
+
+    def change(points):
+        points["return_point_wave_location"] /= 1000
+
+    path = edit_points(tmp_path / "strip.las", tmp_path / "ns.las", change)
+    content = path.read_bytes()
+    path.write_bytes(content.replace((1000).to_bytes(4, "little"), (1).to_bytes(4, "little"), 1))
+    lines = _print("run", path, "-o", tmp_path / "o", "--profile", "fast", "--quiet").stderr
+    assert "samples 0.001 ns apart" in lines and "100% of " in lines and "the second lies off its ray" in lines
+
+
 def test_a_foot_in_the_crs_of_a_strip_in_metres_does_not_stop_it(tmp_path):
     """Spacing and vectors agree: only the label is wrong, and echoes lie where they should."""
     simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)

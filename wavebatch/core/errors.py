@@ -49,6 +49,7 @@ WARNINGS = {
     "lost-packets": "points whose packets cannot be used: they are written without attributes",
     "lost-samples": "packets are longer than their descriptor gives: what lies behind is not read",
     "foreign-packets": "the packets, or the return locations, do not belong to the points",
+    "repeated": "packets may be of one pulse though their times do not say so: its echoes are written once for each",
     "empty": "no points, no waveforms or no echoes",
     "nothing-selected": "the selection leaves no point",
     "pulse-guess": "the survey knows the pulse too little: widths, errors and the number of echoes depend on it",

@@ -72,6 +72,8 @@ class VectorDecision:
     evidence: str
     warnings: tuple[str, ...]
     problems: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+    """Warnings by which echoes lie wrong."""
 
 
 @changeable
@@ -151,14 +153,14 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
         chosen = "toward" if option == "auto" else option
         return VectorDecision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
     ratio = quantile(np.concatenate(tally.ratios), 0.5)
-    warnings, problems = [], []
+    warnings, problems, doubts = [], [], []
     if tally.form == "range":
         warnings.append(
             f"packet vectors are more than {RANGE_RATIO:g} times c/2 long; they are read as whole paths (as Optech "
             "wrote them) and divided by minus the return location"
         )
     if not any(LEAST_RATIO <= length <= LARGEST_RATIO for length in (ratio, metres * ratio)):
-        warnings.append(
+        doubts.append(
             f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00), as unit vectors are, or those in "
             "another unit than metres per ps; new echoes may lie wrong"
         )
@@ -179,7 +181,7 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
         if chosen != option or problems:
             warnings.append(f"--direction {option} overrides the evidence of the file: {evidence}")
         chosen, problems, evidence = option, [], f"given; {evidence}"
-    return VectorDecision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
+    return VectorDecision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems), tuple(doubts))
 
 
 WAVEFORMS, SAMPLES = 1024, 1 << 20
@@ -311,6 +313,9 @@ PACKED_BITS = (10, 12)
 MOST_BITS = 32
 MAX_SPACING = 1000.0
 """Largest spacing of samples [ns]; digitizers have 0.2 to 10 ns, a larger one is damage."""
+USUAL_SPACINGS = 0.01, 100.0
+"""Spacings of samples [ns] without a warning: no converter is faster, and no pulse of lidar so long; ps that are ns, fs
+or µs are off by 1000."""
 MOST_STORED = 2**31 - 1
 """Largest stored coordinate."""
 MAX_LOCATION = 1e9

@@ -577,7 +577,8 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
             way = np.diff(xyz, axis=0)
             apart = np.sqrt((way**2).sum(axis=1))
             off = np.sqrt(((way + place[:, None] * vectors[1:]) ** 2).sum(axis=1))
-            good = same & (points["wavepacket_index"][1:] > 0) & (by_time > _LEAST_PAIR) & np.isfinite(apart)
+            good = same & (points["wavepacket_index"][1:] > 0) & (by_time > 0) & np.isfinite(apart)
+            good &= np.maximum(by_time, apart) > _LEAST_PAIR  # by times in ns all are close
             ratios.append((apart / by_time)[good])
             bends.append((off / by_time)[good])
     ratio, height = np.concatenate(ratios), np.concatenate(heights)

@@ -30,6 +30,7 @@ from wavebatch.files.las.header import LasHeader, locate
 from wavebatch.files.las.read_points import PointSource
 from wavebatch.files.strip import packet_check as check
 from wavebatch.files.strip.packets import PacketFile, StripFacts
+from wavebatch.kernels.geometry.group_returns import on_ray
 
 MAX_RETURNS = 32
 """More points on one packet are damage: LAS has at most 15 returns."""
@@ -316,6 +317,9 @@ class _Tally:
     pairs: int = 0
     twice: int = 0
     """Pairs of points with one packet that were looked at, and those of one return."""
+    looked: int = 0
+    one_ray: int = 0
+    """Points that were looked at, and those with the ray of the packet before and a time that does not part them."""
 
     def add(self, points: np.ndarray, start: int, judged: check.Judged, bounds: list[tuple[float, float]]) -> None:
         if any(least < low or most > high for (least, most), (low, high) in zip(judged.ends, bounds, strict=False)):
@@ -338,6 +342,8 @@ class _Tally:
         self.stray += other.stray
         self.pairs += other.pairs
         self.twice += other.twice
+        self.looked += other.looked
+        self.one_ray += other.one_ray
 
     def describe(self) -> dict[check.Reason, tuple[int, int]]:
         found = [reason for reason in check.Reason if reason in check.REASON_TEXTS and self.reasons[reason]]
@@ -355,6 +361,10 @@ class _Tally:
             where = f"of {count(self.pairs, 'pair')} of points with one packet that were looked at, {self.twice} have"
             line = f"{where} one place, time and return number: points are stored twice, also in the cloud, so that "
             doubts[f"{line}densities are too high; remove the copies"] = "packets"
+        if self.one_ray > MANY_TWICE * self.looked:
+            where = f"{self.one_ray} of {self.looked} points that were looked at have the ray of the packet before them"
+            doubts[f"{where}, and no GPS time of their own: if both are of one pulse, its echoes are in the cloud once "
+                   "for each packet, and return numbers are wrong; give each pulse its time"] = "repeated"  # fmt: skip
         return doubts
 
 
@@ -471,6 +481,12 @@ class Scanner:
         decision = check.decide_direction(found.votes, facts.direction_option, metres_per_unit(facts.units)[0])
         reasons = tally.describe()
         problems = list(decision.problems)
+        doubts = {**tally.doubt(), **dict.fromkeys(decision.doubts, "units")}
+        fastest, slowest = check.USUAL_SPACINGS
+        for kind, one in facts.digitizers.items():
+            if tally.by_descriptor[kind] and (0 < one.spacing < fastest or slowest < one.spacing <= check.MAX_SPACING):
+                line = f"descriptor {kind} has samples {one.spacing:g} ns apart, as no digitizer has: widths, energies"
+                doubts[f"{line} and their errors are wrong if its unit is not the picosecond; correct it"] = "units"
         if not usable and missing < points:
             packet_file = facts.packets.file
             if packet_file is None:
@@ -507,8 +523,8 @@ class Scanner:
             overfull=overfull,
             context=found.context,
             decoded=found.decoded,
-            warnings=(*describe_oddities(reasons, tally.short), *decision.warnings, *tally.doubt()),
-            doubts=tally.doubt(),
+            warnings=(*describe_oddities(reasons, tally.short), *decision.warnings, *doubts),
+            doubts=doubts,
             problems=tuple(problems),
             forms=check.find_forms(facts.digitizers, self._packets, found.sample),
         )
@@ -571,6 +587,17 @@ class Scanner:
         self._found.claimed += int(np.minimum(least, size).sum())
         self._found.tally.long += int(np.count_nonzero(size >= least + PADDING))
         if len(rows):
+            # Packets of one ray whose time is that of many others: a pulse with a packet for each return, it may be.
+            time, some = np.nan_to_num(points["gps_time"]), rows[rows < len(points) - LONGEST_RUN][:_PAIRS]
+            head, next_one = some[:-1], some[1:]
+            one_ray = (judged.keys[head] != judged.keys[next_one]) & (time[head] == time[next_one + LONGEST_RUN])
+            for name in check.VECTORS:
+                one_ray &= points[name][head] == points[name][next_one]
+            self._found.tally.looked += len(some)
+            if one_ray.any():
+                pair = [take_whole_records(points, place[one_ray]) for place in (head, next_one)]
+                head, next_one = (locate(records, self._facts.header) for records in pair)
+                self._found.tally.one_ray += int(np.count_nonzero(on_ray(head, next_one, check.stack_vectors(pair[1]))))
             step = max(1, self._thinning * len(rows) // _VOTERS)
             self._found.votes.add_points(take_whole_records(points, rows[::step]))
             self._vote(groups, near, own)
