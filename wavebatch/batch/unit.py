@@ -36,7 +36,7 @@ from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.point_filter import TESTS, PlannedFilter
 from wavebatch.files.cloud.writer import OutputLayout
-from wavebatch.files.disk.raw_bytes import naming, undoing
+from wavebatch.files.disk.raw_bytes import join_records, naming, undoing
 from wavebatch.files.disk.temp_store import Spool, spool_rows
 from wavebatch.files.las.header import split_numbers
 from wavebatch.files.las.write_points import CHUNK_POINTS, Chunk, Statistics, compress_rows
@@ -488,7 +488,7 @@ def pack_chunk(path: Path, parts: list[RowSpan], point_format: int) -> tuple[Chu
         Where they cannot be compressed.
     """
     start = Seconds.now()
-    rows = np.concatenate([rows.read(0)[first:stop] for rows, first, stop in parts])
+    rows = join_records(*(rows.read(0)[first:stop] for rows, first, stop in parts))
     (chunk,) = pack_rows(path, rows, point_format)
     return chunk, Seconds.now() - start
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import LOCK_FLAGS, Draft, list_names, make_locked, remove_unlocked, reporting
-from wavebatch.files.disk.raw_bytes import Closing, in_one_line, read_exactly, take_whole_records
+from wavebatch.files.disk.raw_bytes import Closing, in_one_line, join_records, read_exactly, take_whole_records
 
 _LOCK = "lock"
 _place: ContextVar[Path | None] = ContextVar("wavebatch_scratch", default=None)
@@ -177,7 +177,7 @@ class Spool(Closing):
             self._write(*self._take_pending())
         else:
             starts, parts = self._take_pending()
-            self._memory = starts, np.concatenate(parts) if parts else np.empty(0, self.dtype)
+            self._memory = starts, parts[0] if len(parts) == 1 else join_records(np.empty(0, self.dtype), *parts)
         return self
 
     def __getstate__(self) -> dict[str, Any]:
@@ -234,7 +234,7 @@ class Spool(Closing):
         bucket = np.concatenate([part for part, _ in pending])
         if np.any(bucket[1:] < bucket[:-1]):
             order = np.argsort(bucket, kind="stable")
-            bucket, parts = bucket[order], [take_whole_records(np.concatenate(parts), order)]
+            bucket, parts = bucket[order], [take_whole_records(join_records(*parts), order)]
         return np.searchsorted(bucket, np.arange(self.buckets + 1)).astype(np.int64), parts
 
     def _write(self, starts: np.ndarray, parts: list[np.ndarray]) -> None:

@@ -701,14 +701,14 @@ class _Near:
         return take_whole_records(self.points, self.index[rows] - self.start)
 
     def follow(self, least: int, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray) -> _Near:
-        """The part from file index `least` on, a copy, which frees memory, and the points that follow.
+        """The part from file index `least` on, copied, which frees memory, and the points that follow.
 
         These are all of one unit; those at `index` are usable.
         """
         at, first = int(np.searchsorted(self.index, least)), max(self.start, least)
         keys, index = np.concatenate([self.keys[at:], keys]), np.concatenate([self.index[at:], index])
         units = np.append(self.unit[at:], np.full(len(keys) - len(self.unit[at:]), unit))
-        return _Near(keys, index, units, join_records(self.points[first - self.start :].copy(), points), first)
+        return _Near(keys, index, units, join_records(self.points[first - self.start :], points), first)
 
 
 def _find_cut(rest: np.ndarray, part: np.ndarray) -> int:

@@ -202,6 +202,8 @@ def position(
     most, bent, apart = np.zeros(len(block)), np.zeros(len(echoes)), np.zeros(len(block))
     point = np.full(len(echoes), -1, np.int64)
     returns = block.returns
+    east, north, up = block.direction.T
+    square = east**2 + north**2 + up**2
     if returns is not None and len(returns):
         reach, own = tolerance + 0.5 * block.spacing, (len(block), waveform, echoes.time, echoes.time_err)
         match = match_returns(waveform, echoes.time, returns.waveform, returns.time, reach)
@@ -215,9 +217,10 @@ def position(
         several = np.flatnonzero(np.bincount(returns.waveform)[returns.waveform] > 1)
         if len(several):
             of, away = returns.waveform[several], np.zeros(len(returns))
-            off = returns.xyz[several] - block.origin[of] - block.direction[of] * returns.time[several, None]
+            time, places = returns.time[several], zip(returns.xyz.T, block.origin.T, block.direction.T, strict=True)
+            off = [at[several] - origin[of] - way[of] * time for at, origin, way in places]
             with np.errstate(divide="ignore", invalid="ignore"):
-                away[several] = np.sqrt((off * off).sum(axis=1) / (block.direction[of] ** 2).sum(axis=1))
+                away[several] = np.sqrt((off[0] ** 2 + off[1] ** 2 + off[2] ** 2) / square[of])
             away[away <= block.spacing] = 0.0  # a location may be rounded to a sample
             np.maximum.at(most, returns.waveform, away)
             bent = np.where(match >= 0, away[match], most[waveform])
@@ -232,8 +235,7 @@ def position(
     along = echoes.time - offset[waveform]
     # `take` copies whole rows: a tenth of the time of an index.
     xyz = block.origin.take(waveform, axis=0) + block.direction.take(waveform, axis=0) * along[:, None]
-    east, north, up = block.direction.T
-    speed = np.sqrt(east**2 + north**2 + up**2)
+    speed = np.sqrt(square)
     # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
     # Between return and echo, vectors that are not as long as light is fast miss by the difference.

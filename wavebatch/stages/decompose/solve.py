@@ -102,17 +102,13 @@ def find_clusters(
 def _join_plateaus(block: WaveformBlock, candidates: decompose.Candidates, clip: float) -> decompose.Candidates:
     """Candidates, one for each flat top: clipped samples between two candidates are no sign of two echoes."""
     waveform, time, amplitude, _ = candidates
-    if len(waveform) < 2 or not (block.samples >= clip).any():
-        return candidates
-    pair = np.flatnonzero(waveform[1:] == waveform[:-1])
-    present, row = np.unique(waveform[pair], return_inverse=True)
-    s = block.samples.shape[1]
     # Places of clipped samples, not a table of pairs by samples: one waveform of 65,536 samples may have 10,000 pairs.
-    clipped = np.flatnonzero(block.samples[present] >= clip)
+    clipped = np.flatnonzero(block.samples >= clip if len(waveform) > 1 else ())
     if not len(clipped):
         return candidates
+    pair, s = np.flatnonzero(waveform[1:] == waveform[:-1]), block.samples.shape[1]
     begin, end = np.rint(time[pair]).astype(np.int64), np.rint(time[pair + 1]).astype(np.int64)
-    first, stop = (row * s + np.clip(place, 0, s - 1) for place in (begin + 1, end))
+    first, stop = (waveform[pair] * s + np.clip(place, 0, s - 1) for place in (begin + 1, end))
     between = np.searchsorted(clipped, stop) - np.searchsorted(clipped, first)
     flat = (between >= LEAST_PLATEAU) & (end - begin - 1 - between <= PLATEAU_SLACK)
     if not flat.any():
