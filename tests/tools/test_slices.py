@@ -184,6 +184,23 @@ def test_picture_of_a_slice(strip, tmp_path):
         assert target.read_bytes().startswith(b"\x89PNG")
 
 
+def test_units_of_long_waveforms_are_small_and_give_the_same_segments(strip, tmp_path, monkeypatch):
+    """50,000 waveforms of 1,000 samples took 2.3 GB."""
+    succeed("slice", strip, "-o", tmp_path / "a.csv")
+    read = []
+
+    class Reader(StripReader):
+        def read_blocks(self, unit, *more):
+            read.append(len(unit.points))
+            return super().read_blocks(unit, *more)
+
+    monkeypatch.setattr("wavebatch.cli.geometry.StripReader", Reader)
+    monkeypatch.setattr("wavebatch.cli.geometry.MOST_SAMPLES", 80 * 1000)
+    succeed("slice", strip, "-o", tmp_path / "b.csv")
+    assert len(read) > 3 and max(read) < 1100
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+
+
 def test_a_shuffled_strip_says_what_to_do(tiny_strip, tmp_path, edit_points, rng):
     shuffled = edit_points(tiny_strip, tmp_path / "s.las", lambda points: rng.permutation(points))
     result = run(shuffled, "-o", tmp_path / "s.csv")

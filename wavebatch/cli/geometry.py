@@ -27,7 +27,7 @@ from wavebatch.files.las.crs import describe_crs, read_crs_definition
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
 from wavebatch.tools import slice_output
-from wavebatch.tools.scan_slices import SliceOptions, cut_slice, find_segments, read_scan_lines
+from wavebatch.tools.scan_slices import MOST_SAMPLES, SliceOptions, cut_slice, find_segments, read_scan_lines
 from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions, VoxelSummary, voxelize_strip
 
@@ -106,7 +106,10 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
     """Writes the segments of the wanted lines of one strip; returns their counts and says them."""
     (first, end), overwrite = options["lines"], options["overwrite"]
     png, overview = options["png"], options["overview"]
-    with StripReader(strip, direction=options["direction"]) as reader, reader.scan() as scan, ExitStack() as stack:
+    with StripReader(strip, direction=options["direction"]) as reader:
+        longest = max((one.n_samples for one in reader.facts.digitizers.values()), default=0)
+    units = MOST_SAMPLES // max(longest, 1)  # of 50,000 waveforms of 1,000 samples took 2.3 GB
+    with StripReader(reader.facts, unit_points=units) as reader, reader.scan() as scan, ExitStack() as stack:
         crs = None
         if output is not None and output.suffix.lower() == ".geojson":
             known = read_crs_definition(strip, reader.facts.header)
