@@ -81,6 +81,8 @@ class TargetResult:
     """Share of the air that a column of reflectances held, which was taken off; None where it is not known."""
     apart: float = 0.0
     """Scatter of the constants of its parts, relative; of dark and bright echoes of a column of reflectances."""
+    hidden_m: float | None = None
+    """Width of its middle in which no echo lies [m]; None where it is a small part of its outline."""
     refused: str = ""
     """Why the target gave no constant."""
     channel: str = ""

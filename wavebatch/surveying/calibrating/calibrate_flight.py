@@ -39,9 +39,10 @@ MOST_TIES = 200_000
 MOST_OF_COLUMN = 20_000
 """Most waveforms of a strip that are decomposed for a column of reflectances, from whole squares as well."""
 
-OTHER_ANGLES = 0.1
+OTHER_ANGLES, MOST_OF_SWATH = 0.1, 0.5
 """Standard deviation of the angles at which one place is seen, over that of all, from which light that falls from side
-to side shows: of light that falls by a fifth, 2 % are a trend then (LEAST_SPREAD)."""
+to side shows: of light that falls by a fifth, 2 % are a trend then (LEAST_SPREAD); and that of all in the overlaps over
+that of a whole swath, since overlaps in its middle say nothing of its edges."""
 
 _Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper corner in x and y [m]."""
@@ -67,6 +68,8 @@ class FlightStrip:
     """How the targets were seen by each channel, as VIEW."""
     right: tuple[float, float]
     """Unit vector to the right of its flight."""
+    width: float
+    """As `Setting.width`."""
 
 
 class Source(NamedTuple):
@@ -172,14 +175,15 @@ def read_strip(
             ties=np.concatenate(shorts),
             seen=views,
             right=source.setting.right,
+            width=source.setting.width,
         )
 
 
 LEAST_SPREAD = 0.01
 """Smaller changes of the brightness are not named."""
 
-EXPLAINED = 0.8
-"""A trend leaves at most this share of the scatter."""
+EXPLAINED, SURE_TREND = 0.8, 6.0
+"""A trend leaves at most this share of the scatter, or it is so many times its error."""
 
 MOST_EDGE_ERROR = 0.05
 """The term over the scan angle is refused where it is less certain than this at the edge of the swath, relative."""
@@ -282,9 +286,10 @@ def fit_swath(
 
 
 def find_trend(
-    ties: adjust.Ties, anchors: adjust.Anchors, seen: np.ndarray, adjusted: adjust.Adjustment
+    ties: adjust.Ties, anchors: adjust.Anchors, seen: np.ndarray, adjusted: adjust.Adjustment, *, fitted: bool = False
 ) -> Trend | None:
-    """Find what explains most of the scatter that constants leave in the overlaps; None where nothing explains a part.
+    """Find what explains most of the scatter that constants leave in the overlaps; None where nothing explains a part,
+    and nothing is sure by its resamples.
 
     Parameters
     ----------
@@ -293,23 +298,31 @@ def find_trend(
     seen : array of VIEW (n,)
         How each source saw the targets.
     adjusted : Adjustment
+    fitted : bool
+        Whether a term over the scan angle was fitted, whose error holds what overlaps leave open.
     """
-    best, least = None, EXPLAINED * adjusted.scatter
-    if adjusted.scatter < LEAST_SPREAD:
-        return None
-    for name, columns, at_targets in _list_columns(ties, seen):
+    best: list[tuple[float, float, Trend]] = []
+    for name, columns, at_targets in _list_columns(ties, seen) if len(ties.cell) else ():
         known = np.isfinite(at_targets).all(axis=1)
         shown = replace(anchors, columns=np.where(known[:, None], at_targets, 0.0))
         fit = adjust.adjust_constants(ties, shown, columns, 0)
-        if fit.scatter >= least:
-            continue
         used = np.isfinite(fit.residual)
-        effect = columns[used] @ fit.terms - float(np.mean(at_targets[known] @ fit.terms))
+        against = columns[used] - at_targets[known].mean(axis=0)
+        effect = against @ fit.terms
+        spread = float(np.sqrt(np.mean(effect**2)))
+        explains = adjusted.scatter >= LEAST_SPREAD and fit.scatter < EXPLAINED * adjusted.scatter
+        if not explains:
+            # Uneven cells hide what all of them show together; range and incidence only follow the angle then.
+            if fitted or spread < LEAST_SPREAD or name not in ("scan angle", "time"):
+                continue
+            again = adjust.adjust_constants(ties, shown, columns).term_trials
+            if spread < SURE_TREND * float(np.sqrt(np.mean(np.var(against @ again.T, axis=1)))):
+                continue
         low, high = np.quantile(effect, [0.02, 0.98])
         share = f"{100 * np.expm1(high - low):.0f} %"
         doubt = f"brightness changes with the {name} by {share} in the overlaps: {_REMEDY[name]}"
-        best, least = Trend(doubt, float(np.sqrt(np.mean(effect**2)))), fit.scatter
-    return best
+        best.append((fit.scatter, float(np.std(fit.residual[used])), Trend(doubt, spread)))
+    return min(best)[2] if best else None
 
 
 def _list_columns(ties: adjust.Ties, seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -425,7 +438,9 @@ def calibrate_flight(
     calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath).widened(edge)
     angle, of = ties.view["angle"], ties.cell
     within = angle - (np.bincount(of, angle) / np.bincount(of))[of]
-    if not swath and not (len(angle) and np.std(within) > OTHER_ANGLES * np.std(angle)):
+    width = max(strip.width for strip in strips)
+    tells = len(angle) and np.std(within) > OTHER_ANGLES * np.std(angle) and np.std(angle) > MOST_OF_SWATH * width
+    if not swath and not tells:
         calibration = replace(calibration, conditions=calibration.conditions + ONE_VIEW)
     names = [source.name for source in sources]
     pairs = tuple(adjust.compare_pairs(ties, adjusted, names))
@@ -441,7 +456,7 @@ def calibrate_flight(
             lost.append(source.name)
     notes = [*calibration.notes, *adjust.find_doubts(lost, calibration.strips, pairs)]
     # What the overlaps leave unexplained is in the errors; where it is more than these, it is said.
-    trend, more = find_trend(ties, anchors, seen, adjusted), []
+    trend, more = find_trend(ties, anchors, seen, adjusted, fitted=bool(swath)), []
     spread = adjusted.scatter if trend is None else max(adjusted.scatter, trend.spread)
     if spread >= LEAST_SPREAD:
         stated = max(row.relative_error for row in calibration.strips)

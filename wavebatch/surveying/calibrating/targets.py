@@ -166,10 +166,15 @@ another unit, such as a hundredth of a share. Ten times too little looks like a 
 MOST_CLIPPED = 0.2
 """Share of clipped echoes from which a target is refused: the others are the dim ones, by a third of their scatter."""
 
-EDGE_SIGMA, LEAST_EDGE, LEAST_CORE = 4.0, 0.01, 0.1
+EDGE_SIGMA, LEAST_EDGE, LEAST_CORE, SIZES = 4.0, 0.01, 0.1, 16
 """Echoes of the outer half differ from the others where their medians do by so many errors and by the second share; the
-few in the middle differ from all by the third, which no stain does: the target is smaller than its outline."""
+few in the middle differ from the rest by the third, which no stain does: the target is smaller than its outline; and
+how many sizes of it are tried."""
 
+
+MOST_HOLE = 0.25
+"""Part of an outline, as a length, without an echo in its middle from which a target of that size is said not to show:
+thirty echoes that lie by chance leave as much in one of seven outlines, twenty in one of four."""
 
 LEAST_NEGATIVE, MOST_REFLECTANCE, BRIGHT = 0.01, 1.5, 0.1
 """Share of negative values from which a column of reflectances is in dB; most that surfaces send back along the light:
@@ -260,6 +265,11 @@ def measure_target(
     strange = float(np.mean(other_surface))
     # Footprints on both surfaces lie between them: the farthest tell the other one.
     strange_err = float(np.quantile(off[other_surface], 0.84)) if strange > MOST_STRANGE else 0.0
+    low, high = target.corners.min(axis=0), target.corners.max(axis=0)
+    places = np.zeros((1024, 3))
+    places[:, :2] = low + (high - low) * (np.indices((32, 32)).reshape(2, -1).T + 0.5) / 32
+    deepest = float(target.depth(places[target.contains(places)]).max(initial=0.0))
+    hole = deepest - float(depth[used].max())
     result = replace(
         summarise(blank, constant),
         incidence_deg=float(np.degrees(np.median(angle[used]))),
@@ -268,6 +278,7 @@ def measure_target(
         edge=edge,
         strange=strange,
         apart=_compare_parts(relative, rows["xyz"][used]),
+        hidden_m=round(2.0 * hole, 2) if hole > MOST_HOLE * deepest else None,
     )
     inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(result.echoes - 1)
     hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
@@ -382,14 +393,18 @@ def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None
     off = middle[0] / middle[1] - 1.0
     if abs(off) >= max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
         return float(off), abs(middle[0] - middle[1])  # over the median of all, which is the constant
-    inwards, oddest = np.argsort(depth), np.argmax(np.abs(constant - np.median(constant)))
+    inwards, oddest, half = np.argsort(depth), np.argmax(np.abs(constant - np.median(constant))), len(depth) // 2
     # A target much smaller than its outline has one echo, which differs most: else it is one of many spots.
-    for few in (LEAST_ECHOES // 2, 1)[: 1 + (inwards[-1] == oddest)]:
-        core = float(np.median(constant[inwards[-few:]]))
-        off = float(np.median(constant)) / core - 1.0
-        if abs(off) >= max(LEAST_CORE, EDGE_SIGMA * max(spreads) * MEDIAN_ERROR / few**0.5):
-            return off, abs(off / (1.0 + off))
-    return None, 0.0
+    sizes = np.unique(np.linspace(LEAST_ECHOES // 2, half, SIZES).astype(np.int64)).tolist()
+    found: list[tuple[float, float]] = []
+    for few in sizes + [1] * bool(inwards[-1] == oddest):
+        inner, rest = constant[inwards[-few:]], constant[inwards[:-few]]
+        core, other = float(np.median(inner)), float(np.median(rest))
+        spread = MAD_TO_STD * float(np.median(np.abs(np.append(inner / core, rest / other) - 1.0)))
+        sure = abs(other / core - 1.0) / max(LEAST_CORE, EDGE_SIGMA * spread * MEDIAN_ERROR / few**0.5)
+        found.append((sure, float(np.median(constant)) / core - 1.0))
+    sure, off = max(found)
+    return (off, abs(off / (1.0 + off))) if sure >= 1.0 else (None, 0.0)
 
 
 def combine_targets(
@@ -630,6 +645,11 @@ def _list_doubts(
             yield (
                 f"{result.name}: echoes near its outline give a constant {100 * result.edge:+.1f} % off that of its "
                 "middle: check outline and coordinates; the error holds it"
+            )
+        if result.hidden_m is not None:
+            yield (
+                f"{result.name}: no echo lies in its middle, so that a target of {result.hidden_m:.1f} m in a larger "
+                "outline would not show: make sure that it is as large as the outline"
             )
         if result.strange > MOST_STRANGE:
             yield (

@@ -176,7 +176,8 @@ class Setting(NamedTuple):
     scenes: dict[_Channel, tuple[float, ...]]
     """Logarithms of the QUANTILES of that light, for each channel."""
     places: dict[_Channel, np.ndarray]
-    """East, north, logarithm of that light, and time from -1 to 1 of waveforms of each channel, f8 (4, k)."""
+    """East, north, logarithm of that light as if the ground were level, time from -1 to 1, and by how much the ray goes
+    to the right, of waveforms of each channel, f8 (5, k)."""
     right: tuple[float, float]
     """Unit vector to the right of the flight."""
     fades: Change
@@ -188,6 +189,8 @@ class Setting(NamedTuple):
     sides: tuple[Change, ...] = ()
     """How light grows from one half of the swath to the other, and from its middle to both edges; empty where the
     flight has no right side."""
+    width: float = 0.0
+    """Standard deviation of how much rays go to the right."""
 
 
 def weigh_change(
@@ -247,12 +250,13 @@ def compare_scenes(
 
 def compare_ground(
     places: np.ndarray, known: np.ndarray, noise: float | None = None, *, chance: float, usual: float = 0.0
-) -> tuple[Change, Change | None] | None:
-    """Weigh by how much the ground that a calibrated strip saw too is brighter, and how that grows along the strip.
+) -> tuple[Change, Change | None, Change] | None:
+    """Weigh by how much the ground that a calibrated strip saw too is brighter, how that grows along the strip, and how
+    it changes across the flight.
 
     Parameters
     ----------
-    places : float array, shape (4, k)
+    places : float array, shape (5, k)
         As `Setting.places`.
     known : float array, shape (m, 3)
         East, north and logarithm of the light of places of the calibration.
@@ -262,9 +266,10 @@ def compare_ground(
 
     Returns
     -------
-    level, growth : Change
-        Growth is that from the first half of the strip to the second; None where common ground is at one end. None
-        instead of both for too little common ground, or where its pattern is not the same.
+    level, growth, across : Change
+        Growth is that from the first half of the strip to the second; None where common ground is at one end. Across:
+        the shift holds 68 % of the places. None instead of all for too little common ground, or where its pattern is
+        not the same.
     """
     there = known.T
     if not (there.size and places.size):
@@ -274,17 +279,20 @@ def compare_ground(
     rows = np.flatnonzero(apart.min(axis=1) < NEAR)
     if len(np.unique(near[rows])) < LEAST_COMMON:
         return None
-    light, time = places[2:, near[rows]]
+    light, time, side = places[2:, near[rows]]
     off, whole = light - there[2, rows], np.hypot(robust_std(light), robust_std(there[2, rows]))
     if robust_std(off) > LIKE_GROUND * whole:
         return None
     # Warming up, or failing for a time, moves parts of the strip.
-    parts = np.array_split(off[np.argsort(time, kind="stable")], len(np.unique(near[rows])) // LEAST_COMMON)
-    middles = [float(np.sort(part)[len(part) // 4 : -(len(part) // 4)].mean()) for part in parts]
-    rest = np.concatenate([part - middle for part, middle in zip(parts, middles, strict=True)])
-    rest = np.clip(rest, -BORDER * robust_std(rest), BORDER * robust_std(rest))
-    doubt = float(np.hypot(MEDIAN_ERROR * np.std(rest) * (len(parts) / len(off)) ** 0.5, SAME_GROUND))
-    uneven = weigh_change(float(np.std(middles)), doubt, chance=chance)._replace(is_uneven=True)
+    found = []
+    for order in (np.argsort(time, kind="stable"), np.argsort(side, kind="stable")):
+        parts = np.array_split(off[order], len(np.unique(near[rows])) // LEAST_COMMON)
+        middles = np.array([float(np.sort(part)[len(part) // 4 : -(len(part) // 4)].mean()) for part in parts])
+        rest = np.concatenate([part - middle for part, middle in zip(parts, middles, strict=True)])
+        rest = np.clip(rest, -BORDER * robust_std(rest), BORDER * robust_std(rest))
+        doubt = float(np.hypot(MEDIAN_ERROR * np.std(rest) * (len(parts) / len(off)) ** 0.5, SAME_GROUND))
+        found.append(weigh_change(float(np.std(middles)), doubt, chance=chance)._replace(is_uneven=True))
+    uneven, across = found[0], found[1]._replace(shift=float(np.quantile(np.abs(middles), 0.68)))
     # Neighbours on two sides of a field's border say nothing.
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
     off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
@@ -292,10 +300,10 @@ def compare_ground(
     doubt = float(np.hypot(MEDIAN_ERROR * error, SAME_GROUND))
     level = weigh_change(float(np.median(off)), doubt, noise, chance=chance, usual=usual)
     if spread < SPAN:
-        return level, None
+        return level, None, across
     slope = float(np.polyfit(time, off, 1)[0])
     even = weigh_change(slope, float(np.hypot(error / spread, SAME_GROUND)), chance=chance)
-    return level, uneven if even.chance <= LIKELY < uneven.chance else even
+    return level, uneven if even.chance <= LIKELY < uneven.chance else even, across
 
 
 def measure_setting(
@@ -314,26 +322,26 @@ def measure_setting(
     every = np.concatenate([np.empty((9, 0)), *known.values()], axis=1)
     zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
     right, straight = _find_right(every[0], every[6:8])
-    brightest, scenes, places, fading, sides = {}, {}, {}, [NO_CHANGE], []
+    brightest, scenes, places, fading, sides, width = {}, {}, {}, [NO_CHANGE], [], 0.0
     for channel, rows in known.items():
         time, light, east, north = rows[:4]
         brightest[channel] = float(np.quantile(light, BRIGHT))
         scenes[channel] = tuple(np.log(np.quantile(light, QUANTILES)).tolist())
-        off = time - 0.5 * (time.min() + time.max())
-        places[channel] = np.stack([east, north, np.log(light), off / max(float(off.max()), 1e-9)])
+        off, (level, across) = time - 0.5 * (time.min() + time.max()), _level(rows, right)
+        places[channel] = np.stack([east, north, np.log(level), off / max(float(off.max()), 1e-9), across])
+        width = max(width, float(np.std(across)))
         fading.append(_find_fading(time, light, rows[2:4], chance=chance))
         lines = _compare_lines(time, np.log(light), rows[2:4], chance=chance)
         fading += [lines] if lines.chance > LIKELY else []
-        sides += [_find_sides(rows, right, chance=chance)] if straight >= LEAST_STRAIGHT else []
+        sides += [_find_sides(level, across, rows[2:4], chance=chance)] if straight >= LEAST_STRAIGHT else []
     fades, *uneven = (max(found, key=lambda one: one.error) for found in (fading, *zip(*sides, strict=True)))
-    return Setting(rate, brightest, scenes, places, right, fades, zone, straight, tuple(uneven))
+    return Setting(rate, brightest, scenes, places, right, fades, zone, straight, tuple(uneven), width)
 
 
-def _find_sides(rows: np.ndarray, right: tuple[float, float], *, chance: float) -> tuple[Change, ...]:
-    """How light grows from one half of the swath to the other, and from its middle to both edges.
+def _level(rows: np.ndarray, right: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Light of level ground, and by how much the rays go to the right, of rows as `_read_rows`.
 
-    rows: as `_read_rows`. What slopes do to light is taken off by a plane of the ground in each cell: over a valley
-    light falls to both sides.
+    What slopes do to light is taken off by a plane of the ground in each cell: over a valley light falls to both sides.
     """
     down, (east, north) = rows[5], rows[2:4] - rows[6:8]
     *_, cell, count = cut_cells(rows[2:4], CELLS[1])
@@ -345,9 +353,13 @@ def _find_sides(rows: np.ndarray, right: tuple[float, float], *, chance: float) 
     slopes[:, (count < LEAST_OF_CELL) | (known <= LEAST_PLANE * xx * yy)] = 0.0
     tilt = slopes[0, cell] * east + slopes[1, cell] * north
     light = rows[1] / np.maximum(down + tilt / rows[8], LEAST_FACING)
-    across = (right[0] * east + right[1] * north) / rows[8]
+    return light, (right[0] * east + right[1] * north) / rows[8]
+
+
+def _find_sides(light: np.ndarray, across: np.ndarray, place: np.ndarray, *, chance: float) -> tuple[Change, ...]:
+    """How light, as from `_level`, grows from one half of the swath to the other, and from its middle to both edges."""
     prior: Any = {"chance": chance / 2, "most": USUAL_SIDES}
-    found = (_find_fading(one, light, rows[2:4], **prior) for one in (across, np.abs(across)))
+    found = (_find_fading(one, light, place, **prior) for one in (across, np.abs(across)))
     unseen = weigh_change(0.0, 10.0 * USUAL_SIDES, **prior)  # too few waveforms show nothing
     return tuple(unseen if one is NO_CHANGE else one for one in found)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -26,7 +25,7 @@ from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.attribute.radiometry import AIR_DOUBT
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.calibration import ONE_VIEW, Calibration, ChannelConstant, StripConstant
+from wavebatch.surveying.calibration import ONE_VIEW, Calibration, ChannelConstant
 from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.matching import setting as settings
 from wavebatch.surveying.sensor import FOOT, SensorSource
@@ -144,11 +143,17 @@ def refuse_zone(calibration: Calibration, found: settings.Setting, distance: flo
 
 
 def compare_setting(
-    calibration: Calibration, found: settings.Setting, system: SystemPulse, usual: float = 0.0
+    calibration: Calibration,
+    found: settings.Setting,
+    system: SystemPulse,
+    usual: float = 0.0,
+    energy: float | None = None,
 ) -> tuple[float, list[str], list[str]]:
     """Error that another pulse rate, gain or air adds to the constant, relative, the warnings, and what would not show.
 
-    usual: what `find_growth` knows of air and day; ground in common shows it, too.
+    usual: what `find_growth` knows of air and day; ground in common shows it, too. energy: what a log says of the
+    laser, over the calibration's; the light may say that the laser is as it was, and the log of another scale: half as
+    often, before it is seen, as a gain or energy changes.
     """
     growth, lines, notes = 0.0, [], []
     unseen = usual
@@ -186,7 +191,19 @@ def compare_setting(
         seen = bool(ground or change.chance > settings.LIKELY)
         more = math.expm1(max(change.error, (abs(change.shift) + 0.5 * change.spread * bool(ground)) * seen))
         growth, unseen = max(growth, more), 0.0
-        if change.chance <= settings.LIKELY and more > HIDDEN:
+        step = math.log(energy or 1.0)
+        right, wrong = (-0.5 * ((change.shift + off) / math.hypot(change.spread, usual)) ** 2 for off in (0.0, step))
+        doubt = 1.0 / (1.0 + (2.0 - chance) / max(chance, 1e-9) * math.exp(min(right - wrong, 100.0)))
+        most = abs(math.expm1(step + math.copysign(settings.SAME_GROUND, step)))
+        scale = most * min(doubt / settings.LIKELY, 1.0) ** 0.5 if step else 0.0
+        growth = max(growth, scale)
+        if doubt > settings.LIKELY and scale > HIDDEN:
+            lines.append(
+                f"calibration: the log of the energies says {100 * math.expm1(step):+.0f} % against the calibration's, "
+                f"the light {which} that nothing changed: is it of another scale? Then give energy_mean in CAL.toml in "
+                "that scale, or --energy none"
+            )
+        elif change.chance <= settings.LIKELY and more > HIDDEN:
             brighter = f"{100 * math.expm1(change.shift):+.0f} % brighter, which its scatter and moisture may do"
             known = f"ground in common {which} is {brighter}" if ground else f"surfaces {which} differ, none is common"
             notes.append(
@@ -213,9 +230,9 @@ def _compare_places(
     row: ChannelConstant,
     noise: float | None = None,
     usual: float = 0.0,
-) -> tuple[settings.Change, settings.Change | None] | None:
+) -> tuple[settings.Change, settings.Change | None, settings.Change] | None:
     known = np.reshape(calibration.places[: len(calibration.places) // 4 * 4], (-1, 4))
-    seen = found.places.get((row.digitizer, row.scanner), np.empty((4, 0)))
+    seen = found.places.get((row.digitizer, row.scanner), np.empty((5, 0)))
     mine = known[known[:, 0] == settings.number_channel(row.digitizer, row.scanner), 1:]
     return settings.compare_ground(seen, mine, noise, chance=calibration.change_chance, usual=usual)
 
@@ -264,11 +281,24 @@ def judge_fading(
     ]
 
 
-def judge_sides(calibration: Calibration, sides: Sequence[settings.Change]) -> tuple[float, list[str], list[str]]:
+def judge_sides(
+    calibration: Calibration, found: settings.Setting, *, other: bool
+) -> tuple[float, list[str], list[str]]:
     """Error of the constant by light that is uneven across the swath, relative, the warnings, and what would not show.
 
-    Overlaps of strips that were calibrated together show it themselves, where they saw places at several angles.
+    Overlaps of strips that were calibrated together show it themselves, where they saw places at several angles; ground
+    in common shows it for a strip that was not (other).
     """
+    sides = found.sides
+    compared = [_compare_places(calibration, found, row) for row in calibration.channels if other]
+    across = max((ground[2] for ground in compared if ground), key=lambda one: one.chance, default=settings.NO_CHANGE)
+    if across.chance > settings.LIKELY and not calibration.swath:
+        growth = math.expm1(across.shift)
+        return growth, [
+            f"calibration: over ground in common light changes across the swath, by up to {100 * growth:.0f} % for two "
+            "thirds of it: a dirty window, surfaces that are not matt, or two lasers that take turns in step with the "
+            "scan lines? The error of the constant grows by it"
+        ], []
     if not calibration.conditions.endswith(ONE_VIEW) or calibration.swath:
         return 0.0, [], []
     seen = [one.chance > settings.LIKELY for one in sides]
@@ -362,6 +392,12 @@ def match_strip(
     if calibration.haze and attenuation is None:
         calibration = replace(calibration, attenuation=calibration.attenuation / calibration.haze * sensor.haze)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
+    # A strip that was calibrated has its own constants.
+    own = {(row.digitizer, row.scanner): row for row in calibration.strips if row.sha256 == own_strip}
+    rows = [(row, own.get((row.digitizer, row.scanner))) for row in calibration.channels]
+    calibration = replace(calibration, channels=tuple(
+        replace(row, constant=one.constant, relative_error=one.relative_error) if one else row for row, one in rows
+    ))  # fmt: skip
     chance = calibration.change_chance
     setting = settings.measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0, chance=chance)
     refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
@@ -372,7 +408,7 @@ def match_strip(
     other = own_strip not in measured
     growth, later, reasons = find_growth(calibration, reader, sensor, attenuation, other=other)
     if other:
-        more, lines, notes = compare_setting(calibration, setting, system, growth)
+        more, lines, notes = compare_setting(calibration, setting, system, growth, energy)
         # Ground of another day may have changed as well: it proves no air.
         growth, reasons = math.hypot(more, growth * later), [*reasons, *lines]
         if not (calibration.flight and settings.read_day(reader)):
@@ -386,17 +422,17 @@ def match_strip(
         # Light that is seen to fade from the calibrated level on also moves the mean, which the first error holds.
         growth = max(growth, more) if lines else math.hypot(growth, more)
         reasons, notes = [*reasons, *lines], [*notes, *hidden]
-    more, lines, hidden = judge_sides(calibration, setting.sides)
+    more, lines, hidden = judge_sides(calibration, setting, other=other)
     growth, reasons, notes = math.hypot(growth, more), [*reasons, *lines], [*notes, *hidden]
     warnings += reasons
-    own, divergence = system.radiometry.divergence, calibration.divergence
-    if own is not None and divergence is not None and abs(own / divergence - 1.0) > SAME_DIVERGENCE:
+    beam, divergence = system.radiometry.divergence, calibration.divergence
+    if beam is not None and divergence is not None and abs(beam / divergence - 1.0) > SAME_DIVERGENCE:
         warnings.append(
-            f"calibration: measured with a divergence of {divergence:g} mrad, the survey has {own:g} mrad, which is "
-            f"used: one of the two makes cross sections {100 * abs((own / divergence) ** 2 - 1):.0f} % wrong"
+            f"calibration: measured with a divergence of {divergence:g} mrad, the survey has {beam:g} mrad, which is "
+            f"used: one of the two makes cross sections {100 * abs((beam / divergence) ** 2 - 1):.0f} % wrong"
         )
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
-    rows: list[ChannelConstant] = []
+    fitting: list[ChannelConstant] = []
     missing: dict[int, str] = {}
     # Widths at half maximum of the pulses of all digitizers that have one of their own, and of the others as 0 [ns].
     # A hillside widens every echo, so that the survey of its strip finds a wider pulse than the sensor has: where a
@@ -417,8 +453,8 @@ def match_strip(
     for index in sorted(scan.by_descriptor):
         pulse = pulses.get(index, pulses[0])
         found, missing[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
-        rows += found
-    have, seen = {(row.digitizer, row.scanner) for row in rows}, settings.see_channels(reader, scan)
+        fitting += found
+    have, seen = {(row.digitizer, row.scanner) for row in fitting}, settings.see_channels(reader, scan)
     problems: dict[str, dict[int, float]] = {}  # share of the waveforms by digitizer, for each reason
     for (index, scanner), share in seen.items():
         if (index, scanner) not in have:
@@ -436,9 +472,7 @@ def match_strip(
     warnings += [
         f"calibration: no calibrated values for {share:.0%} of the waveforms: {line}" for line, share in named.items()
     ]
-    rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
-    if calibration.strips:
-        rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
+    fitting = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in fitting]
     air = 0.0
     if attenuation is not None and sensor.distance and not later:
         # A strip of the calibration's day that is given other air than the calibration had.
@@ -452,7 +486,7 @@ def match_strip(
                 "--attenuation"
             )
     fitted = replace(
-        calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=(), notes=tuple(notes)
+        calibration, right=setting.right, constant=math.nan, channels=tuple(fitting), strips=(), notes=tuple(notes)
     )
     return fitted.widened(air), tuple(dict.fromkeys(warnings))
 
@@ -561,16 +595,3 @@ def _compare_decomposers(
             "--profile"
         )
     return abs(off)
-
-
-def _take_strip_constants(
-    strips: tuple[StripConstant, ...], rows: list[ChannelConstant], key: str
-) -> Iterator[ChannelConstant]:
-    """The rows; where the strip itself, known by its fingerprint, was calibrated, with the constants of the strip."""
-    own = {(row.digitizer, row.scanner): row for row in strips if row.sha256 == key}
-    for row in rows:
-        found = own.get((row.digitizer, row.scanner))
-        if found is None:
-            yield row
-        else:
-            yield replace(row, constant=found.constant, relative_error=found.relative_error)
