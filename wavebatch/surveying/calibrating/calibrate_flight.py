@@ -312,7 +312,7 @@ def find_trend(
         spread = float(np.sqrt(np.mean(effect**2)))
         explains = adjusted.scatter >= LEAST_SPREAD and fit.scatter < EXPLAINED * adjusted.scatter
         if not explains:
-            # Uneven cells hide what all of them show together; range and incidence only follow the angle then.
+            # Uneven cells hide what all of them show together; range and incidence follow the angle then.
             if fitted or spread < LEAST_SPREAD or name not in ("scan angle", "time"):
                 continue
             again = adjust.adjust_constants(ties, shown, columns).term_trials
@@ -329,7 +329,9 @@ def _list_columns(ties: adjust.Ties, seen: np.ndarray) -> Iterator[tuple[str, np
     """Name, columns (k, m) at the ties and (n, m) at the targets, of each quantity."""
     view = ties.view
     most = float(np.abs(view["angle"]).max())
-    yield "scan angle", swath_columns(view["angle"], most or 1.0), swath_columns(seen["angle"], most or 1.0)
+    columns, at_targets = (swath_columns(angle, most or 1.0) for angle in (view["angle"], seen["angle"]))
+    yield "scan angle", columns, at_targets
+    yield "scan angle", columns[:, :2], at_targets[:, :2]  # two opposite headings do not tell both sides apart
     yield "incidence", 1.0 - np.cos(view["incidence"])[:, None], 1.0 - np.cos(seen["incidence"])[:, None]
     middle = float(np.median(view["distance"])) or 1.0
     yield "range", view["distance"][:, None] / middle - 1.0, seen["distance"][:, None] / middle - 1.0
