@@ -8,6 +8,7 @@ import sys
 import tempfile
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from commands import refuses, run_command
 
@@ -185,3 +186,14 @@ def test_commands_report_a_missing_library_once(tmp_path, monkeypatch):
         assert "bug" not in done.stderr and "built again" in done.stderr
     refuses(InputError, r"missing\.so: cannot be loaded", wb.run, strips, out)
     assert not out.exists()
+
+
+def test_addresses_are_those_of_numpy(tmp_path):
+    """Of what may be written or not, is empty, a part, of a subclass, or lies in a file."""
+    array = np.arange(12, dtype=np.float32).reshape(3, 4)
+    fixed = array.copy()
+    fixed.flags.writeable = False
+    kept = np.memmap(tmp_path / "kept", np.uint8, "w+", shape=5)
+    for one in (array, fixed, array[1:], array[:, 2], np.empty(0), np.empty((0, 3)), np.ones(()), kept,
+                np.frombuffer(b"abcd", np.uint8), array.view(np.recarray)):  # fmt: skip
+        assert library.address(one) == one.ctypes.data

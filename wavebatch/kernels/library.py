@@ -16,7 +16,8 @@ from wavebatch.core.errors import InputError
 from wavebatch.kernels.build_kernels import LIBRARY, SOURCES, compile_library, is_outdated, is_whole
 
 _POINTER = ctypes.c_void_p
-_BYTE: Any = ctypes.c_char.from_buffer  # of an array
+_ADDRESS = object.__basicsize__
+"""Place of an array's address in NumPy's structure of it, which begins as each object of CPython does."""
 
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "filter_rows", "find_maxima", "find_correlated",
@@ -386,8 +387,5 @@ def place(array: np.ndarray, dtype: type) -> int:
 
 
 def address(array: np.ndarray) -> int:
-    """Address of an array's first value; `array.ctypes.data` takes twice as long, and a survey asks 10,000 times."""
-    try:
-        return ctypes.addressof(_BYTE(array))
-    except (TypeError, ValueError):  # of what cannot be written, or is empty
-        return array.ctypes.data
+    """Address of an array's first value: `array.ctypes.data`, in a fifteenth of the time: surveys ask 10,000 times."""
+    return ctypes.c_size_t.from_address(id(array) + _ADDRESS).value

@@ -48,13 +48,18 @@ def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
         Pulse for the kernels.
     """
     if len(system.components) > 1:
-        weight, delay, sigma = system.components[0]
-        rest = tuple(
-            (w * s / (weight * sigma), (d - delay) / spacing, (s * s - sigma * sigma) / spacing**2)
-            for w, d, s in system.components[1:]
-        )
-        return PulseShape(components=rest)
+        return _learned_shape(system.components, spacing)
     return PulseShape(kappa=system.kappa) if abs(system.kappa) >= NO_SKEW else GAUSSIAN
+
+
+@lru_cache(maxsize=16)
+def _learned_shape(components: tuple[tuple[float, ...], ...], spacing: float) -> PulseShape:
+    weight, delay, sigma = components[0]
+    rest = tuple(
+        (w * s / (weight * sigma), (d - delay) / spacing, (s * s - sigma * sigma) / spacing**2)
+        for w, d, s in components[1:]
+    )
+    return PulseShape(components=rest)
 
 
 def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
@@ -283,8 +288,8 @@ def error_factors(
     given = shape, limits, noise.correlation, noise.whitening
     widths, factors = _factor_table(*given)
     # Only those beside a width that is asked for: to make all takes a tenth of a survey.
-    asked = np.append(width[~np.isnan(width)], limits.ref)
-    low, high = np.searchsorted(widths, [asked.min(), asked.max()]).tolist()
+    ends = [least.reduce(width, initial=limits.ref) for least in (np.fmin, np.fmax)]
+    low, high = np.searchsorted(widths, ends).tolist()
     low, high = max(low - 1, 0), high + 1
     missing = low + np.flatnonzero(np.isnan(factors[low:high, 0]))
     if len(missing):

@@ -456,11 +456,6 @@ def _as_text(field: bytes) -> bytes:
     return field
 
 
-def _plain(value: Any) -> Any:
-    """NumPy numbers become numbers; other types that JSON does not have, such as paths, become text."""
-    return value.item() if isinstance(value, np.generic) else str(value)
-
-
 def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], number: int) -> las.Vlr:
     """JSON with sorted keys and no time of day; it also keeps which program wrote the input, and names the columns.
 
@@ -488,7 +483,9 @@ def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], numb
 
 
 def _encode_json(value: Any) -> bytes:
-    text = json.dumps(value, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain)
+    # NumPy numbers become numbers; other types that JSON does not have, such as paths, become text.
+    text = json.dumps(value, sort_keys=True, ensure_ascii=False, separators=(",", ":"),
+                      default=lambda one: one.item() if isinstance(one, np.generic) else str(one))  # fmt: skip
     return text.encode(errors="backslashreplace")
 
 

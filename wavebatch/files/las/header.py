@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import functools
 import os
 import struct
 from collections.abc import Container, Iterable, Sequence
@@ -343,6 +344,7 @@ def read_evlr(path: Path, evlr: Evlr) -> bytes:
         return file.read(evlr.length)
 
 
+@functools.lru_cache(256)
 def decode_text(data: bytes) -> str:
     """Return a text field up to its first NUL: UTF-8, the last letter of which a full field may cut, else Latin-1."""
     text, end, _ = data.partition(b"\0")

@@ -129,7 +129,7 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
     factor(p, d->matrix, d->pivot, 0.1 * NEARLY_SINGULAR);
     for (int64_t r = 0; r < p; r++) {
         for (int64_t c = 0; c < p; c++) d->column[c] = c == r;
-        solve(p, d->matrix, d->column);
+        solve_part(p, d->matrix, d->column, r, r);
         sum += 0.5 * (log_double(fmax(d->column[r], 1)) + log_double(fmin(d->pivot[r], 2)));
     }
     return sum;

@@ -295,12 +295,13 @@ def _find_leverage(lag: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.
             values = values - one * np.bincount(row, one * values)[row]
         basis.append(values / np.sqrt(np.maximum(np.bincount(row, values * values), 1e-9))[row])
     taken, brought = np.zeros((2, *lag.shape))
-    height = signal[row, column].astype(np.float64)
+    sums, height = np.zeros((2, len(z))), signal[row, column].astype(np.float64)
     for i, one in enumerate(basis):
-        taken[row, column] += one * one
+        sums[0] += one * one
         for j, other in enumerate(basis[: i + 1]):
             product = one * other
-            brought[row, column] += (1 if i == j else 2) * product * np.bincount(row, product * height)[row]
+            sums[1] += (1 if i == j else 2) * product * np.bincount(row, product * height)[row]
+    taken[row, column], brought[row, column] = sums
     return taken, brought
 
 
