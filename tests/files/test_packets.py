@@ -505,6 +505,14 @@ def test_a_spacing_in_another_unit_than_picoseconds_is_said(tmp_path, spacing, s
     assert list(doubts.values()) == ["units"] * bool(said) and all(said in line for line in doubts)
 
 
+@pytest.mark.parametrize(("divisor", "code"), [(1, []), (2, ["lost-samples"]), (4, [])])
+def test_sizes_in_samples_are_said(tmp_path, divisor, code):
+    """Half of each waveform was not read, and --quiet hid it."""
+    raw = make_raw(bits=16)
+    raw.points["wavepacket_size"] //= divisor
+    assert list(scan_of(raw.write(tmp_path / "a.las")).doubts.values()) == code
+
+
 @pytest.mark.parametrize("time", [0.0, np.nan, 7.0, None])
 def test_packets_of_one_ray_that_no_time_ties_are_said(tmp_path, time):
     """With a packet for each return, each echo was written once per packet, in silence."""

@@ -47,7 +47,7 @@ WARNINGS = {
     "packets": "packets, or the vectors of their points, are unusual; they are used",
     "lost-points": "the header claims fewer points than the file seems to hold: the others are not read",
     "lost-packets": "points whose packets cannot be used: they are written without attributes",
-    "lost-samples": "packets are longer than their descriptor gives: what lies behind is not read",
+    "lost-samples": "packets are longer than their descriptor gives, or their sizes are no bytes: the rest is not read",
     "foreign-packets": "the packets, or the return locations, do not belong to the points",
     "repeated": "packets may be of one pulse though their times do not say so: its echoes are written once for each",
     "empty": "no points, no waveforms or no echoes",

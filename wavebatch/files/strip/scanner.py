@@ -312,6 +312,9 @@ class _Tally:
     by_descriptor: np.ndarray = field(default_factory=lambda: np.zeros(256, np.int64))
     short: int = 0
     long: int = 0
+    new: int = 0
+    in_samples: int = 0
+    """Packets, and those of as many bytes as their descriptor gives samples, which are too few."""
     stray: int = 0
     """Points far outside the bounds of the header."""
     pairs: int = 0
@@ -339,6 +342,8 @@ class _Tally:
         self.by_descriptor += other.by_descriptor
         self.short += other.short
         self.long += other.long
+        self.new += other.new
+        self.in_samples += other.in_samples
         self.stray += other.stray
         self.pairs += other.pairs
         self.twice += other.twice
@@ -354,6 +359,10 @@ class _Tally:
         if self.long:
             more = f"{count(self.long, 'packet')} longer than the descriptor gives: what lies behind is not read"
             doubts[f"{more}, so echoes may be missing; get the strip with right descriptors"] = "lost-samples"
+        if 2 * self.in_samples > self.new:
+            where = f"{count(self.in_samples, 'packet')} of as many bytes as samples"
+            doubts[f"{where}: sizes seem to be numbers of samples, and half of each waveform or more is not read; get "
+                   "the strip with sizes in bytes"] = "lost-samples"  # fmt: skip
         if self.stray:
             where = f"{count(self.stray, 'point')} outside the bounds that the header claims, by more than their width"
             doubts[f"{where}: points or header are damaged, or axes are swapped; get the file again"] = "units"
@@ -423,6 +432,8 @@ class Scanner:
         self._keeps = facts.header.compressed
         self._widths = np.zeros(256, np.int64)
         self._widths[list(facts.digitizers)] = [digitizer.width for digitizer in facts.digitizers.values()]
+        self._lengths = np.zeros(256, np.int64)
+        self._lengths[list(facts.digitizers)] = [digitizer.n_samples for digitizer in facts.digitizers.values()]
         self._bounds = _find_bounds(facts.header)
         self._first = 0
         """Number of the first unit that is scanned."""
@@ -586,6 +597,9 @@ class Scanner:
         size = points["wavepacket_size"][new]
         self._found.claimed += int(np.minimum(least, size).sum())
         self._found.tally.long += int(np.count_nonzero(size >= least + PADDING))
+        self._found.tally.new += len(new)
+        in_samples = judged.short[new] & (size == np.take(self._lengths, points["wavepacket_index"][new]))
+        self._found.tally.in_samples += int(np.count_nonzero(in_samples))
         if len(rows):
             # Packets of one ray whose time is that of many others: a pulse with a packet for each return, it may be.
             time, some = np.nan_to_num(points["gps_time"]), rows[rows < len(points) - LONGEST_RUN][:_PAIRS]
