@@ -94,6 +94,20 @@ def test_times_in_nanoseconds_in_place_of_picoseconds_are_said(tmp_path, edit_po
     assert "samples 0.001 ns apart" in lines and "100% of " in lines and "the second lies off its ray" in lines
 
 
+@pytest.mark.parametrize(("degrees", "scale"), [(0.0, 0.001), (0.0, 0.1), (3.0, 0.01)])
+def test_points_that_were_turned_without_their_vectors_are_said(tmp_path, edit_points, degrees, scale):
+    """From one zone to another: added echoes lay 30 cm aside, in silence. Coarse coordinates are no turn."""
+    succeed("simulate", "forest", "-o", tmp_path / "strip.las", "--pulses", 1500, "--seed", 1, "--scale", scale, "-q")
+
+    def change(points):
+        place = (points["X"] + 1j * points["Y"]) * np.exp(1j * np.radians(degrees))
+        points["X"], points["Y"] = np.rint(place.real), np.rint(place.imag)
+
+    path = edit_points(tmp_path / "strip.las", tmp_path / "turned.las", change)
+    lines = _print("run", path, "-o", tmp_path / "o", "--profile", "fast", "--quiet").stderr
+    assert ("half lie aside of its ray" in lines) == (degrees > 0)
+
+
 def test_a_foot_in_the_crs_of_a_strip_in_metres_does_not_stop_it(tmp_path):
     """Spacing and vectors agree: only the label is wrong, and echoes lie where they should."""
     simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)

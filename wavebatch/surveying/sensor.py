@@ -108,6 +108,10 @@ LEAST_AGREEING = 20
 """Fewest rays of other digitizers that must agree with a trajectory, each after a ray that does not, for vectors to be
 wrong and not the trajectory."""
 
+MOST_ASIDE = 0.003
+"""Distance of returns from their ray, over that to the first one: real strips have 0.0001. An echo 20 m from its
+return is 6 cm aside then."""
+
 MOST_BENT = 0.1
 """Share of pairs of returns that are off their ray, from which it is said: fewer are returns of two pulses."""
 
@@ -415,13 +419,19 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
             f"{path}: coordinates are degrees, packet vectors metres, so new echoes would be misplaced: project the "
             "strip with its vectors to metres, or write only its own points with `run --points returns`"
         )
-    scale, bent, pairs, _ = measure_scale(reader, scan)
+    scale, bent, pairs, aside, _ = measure_scale(reader, scan)
     bends: tuple[str, ...] = ()
     if bent > MOST_BENT:
         bends = (
             f"in {bent:.0%} of {pairs} pairs of returns of one pulse the second lies off its ray by more than a tenth "
             "of their distance: light is bent at water, or times or vectors are wrong; echoes are placed along "
             "straight rays, and range_err holds how far returns are from there",
+        )
+    elif aside > MOST_ASIDE:
+        bends = (
+            f"of {pairs} pairs of returns of one pulse half lie aside of its ray by {aside:.1%} of their distance and "
+            "more: points were projected anew without their packet vectors, or light is bent at water; added echoes "
+            "lie aside by as much: project both, or run the strip as its vendor wrote it",
         )
     if scale is None:
         doubt = "coordinates are in feet by the CRS, packet vectors as long as metres: added echoes may be far off"

@@ -554,13 +554,17 @@ class PairScale(NamedTuple):
     bent: float = 0.0
     """Share of the pairs whose second return lies off the ray of the first by BENT of their distance, and more."""
     pairs: int = 0
+    aside: float = 0.0
+    """How far the second return is from the ray of the first, over their distance and beyond the steps of coordinates:
+    median."""
     level: bool = False
     """Whether heights count from the ground: most of its points, of which there are LEAST_PAIRS, have the height 0."""
 
 
 def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
     """Compare returns of one pulse, and heights of the ground, at up to SCALE_PLACES places of the strip."""
-    ratios, bends, heights = [np.empty(0)], [np.empty(0)], [np.empty(0)]
+    ratios, bends, asides, heights = [np.empty(0)], [np.empty(0)], [np.empty(0)], [np.empty(0)]
+    rounded = 1.5 * max(map(abs, reader.facts.header.scales))  # of two positions, half a step each, in two axes
     units = _choose_units(scan)
     units, each = units[:: max(1, -(-len(units) // SCALE_PLACES))], max(SCALE_PLACES // max(len(units), 1), 1)
     places = [(first, stop) for begin, stop in units
@@ -581,6 +585,9 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
             good &= np.maximum(by_time, apart) > _LEAST_PAIR  # by times in ns all are close
             ratios.append((apart / by_time)[good])
             bends.append((off / by_time)[good])
+            along = (way * vectors[1:]).sum(axis=1) / np.sqrt((vectors[1:] ** 2).sum(axis=1))
+            side = np.sqrt(np.maximum(apart**2 - along**2, 0.0))
+            asides.append(np.nan_to_num(np.maximum(side - rounded, 0.0) / apart, posinf=0.0)[good])
     ratio, height = np.concatenate(ratios), np.concatenate(heights)
     step = abs(reader.facts.header.scales[2])
     zero = np.count_nonzero(np.abs(height) < 0.5 * step) if step <= FINE_HEIGHTS else 0
@@ -589,7 +596,8 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
         return PairScale(level=level)
     low, middle, high = (quantile(ratio, share) for share in (0.25, 0.5, 0.75))
     bent = float(np.mean(np.concatenate(bends) > BENT))
-    return PairScale(middle if high - low < SCALE_SPREAD * middle else None, bent, len(ratio), level)
+    scale = middle if high - low < SCALE_SPREAD * middle else None
+    return PairScale(scale, bent, len(ratio), quantile(np.concatenate(asides), 0.5), level)
 
 
 def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
