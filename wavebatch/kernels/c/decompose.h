@@ -33,7 +33,7 @@ static int leave_out_faint(Work *work) {
     int64_t lowest = 0;
     if (k < 2) return 0;
     for (int64_t j = 0; j < k; j++) {
-        double time = fit->parameters[k + j], out = fmax(fmax(-time, time - (work->window.n - 1)), 0) / fit->parameters[2 * k + j];
+        double time = fit->parameters[k + j], out = at_least(at_least(-time, time - (work->window.n - 1)), 0) / fit->parameters[2 * k + j];
         double height = fit->parameters[j] * exp_lanes(ALL(-0.5 * out * out))[0];
         if (height < least) { least = height; lowest = j; }
     }
@@ -163,8 +163,8 @@ static int decompose_window(const Settings *s, const Clusters *clusters, int64_t
     const double cost = work->best.cost, fall = least_fall(s, k, work->best.parameters, work->window.std);
     if (!may_grow(s, &work->window) || cost - work->window.used < fall) return 0;
     exchange(&work->best, &work->spare);
-    narrow.low[2] = fmax(limits.low[2], s->width_ref / BREATH);
-    narrow.high[2] = fmin(limits.high[2], s->width_ref * BREATH);
+    narrow.low[2] = at_least(limits.low[2], s->width_ref / BREATH);
+    narrow.high[2] = at_most(limits.high[2], s->width_ref * BREATH);
     if (!set_starts(clusters, cluster, work) || grow_window(s, &narrow, misses_echoes(s, work, cost, fall) ? &known : &free, work) < 0) return -1;
     work->next.k = work->best.k;
     memcpy(work->next.parameters, work->best.parameters, 3 * work->best.k * sizeof(double));
@@ -188,7 +188,7 @@ static void join_broad(const Settings *s, Work *work) {
     for (int64_t j = 0; j < k; j++) square += a[j] * w[j] * (w[j] * w[j] + (t[j] - time) * (t[j] - time));
     const double width = sqrt(square / area);
     if (width < s->width_high) return;
-    limits.high[2] = fmax(s->width_high, BROADEST * s->width_ref);
+    limits.high[2] = at_least(s->width_high, BROADEST * s->width_ref);
     work->fit.parameters[0] = area / width; work->fit.parameters[1] = time; work->fit.parameters[2] = width;
     /* The pulse's misfit may explain one fall, not one for each: several proven echoes would fall together. */
     const double target = best->cost + (k - 2) * s->acceptance + least_fall(s, k, a, work->window.std);
@@ -249,7 +249,7 @@ static void leave_out_unknown(const Settings *s, Work *work) {
             asked = 0;
         } else {
             double more = noise * noise * (PROVEN * PROVEN / (amplitude * amplitude) - 1 / (error * error));
-            work->known[least] = fmax(more, 1e-300); /* above 0: it was asked */
+            work->known[least] = at_least(more, 1e-300); /* above 0: it was asked */
             renew_errors(s, &prior, work);
             asked++;
         }

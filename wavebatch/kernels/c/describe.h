@@ -91,8 +91,8 @@ static void find_reach(const Pulse *shape, double width, double *before, double 
     *before = *after = (shape->kind == SUM_OF_GAUSSIANS ? REACH : 4 * REACH) * width;
     for (int64_t c = 0; c < shape->n_components; c++) {
         const double *part = shape->components + 3 * c, wide = REACH * sqrt(width * width + part[2]);
-        *before = fmax(*before, wide - part[1]);
-        *after = fmax(*after, wide + part[1]);
+        *before = at_least(wide - part[1], *before);
+        *after = at_least(wide + part[1], *after);
     }
 }
 
@@ -102,11 +102,11 @@ static int64_t find_vectors(const Described *w, int64_t first, int64_t k, int64_
     for (int64_t j = first; j < first + k; j++) {
         double before, after;
         find_reach(&w->pulse, w->width[j], &before, &after);
-        low = fmin(low, w->time[j] - before);
-        high = fmax(high, w->time[j] + after);
+        low = at_most(w->time[j] - before, low);
+        high = at_least(w->time[j] + after, high);
     }
-    *from = fmin(fmax(low, 0), w->length - 1) / LANES;
-    return VECTORS((int64_t)fmin(fmax(high, 0), w->length - 1) + 1) - *from;
+    *from = at_most(at_least(low, 0), w->length - 1) / LANES;
+    return VECTORS((int64_t)at_most(at_least(high, 0), w->length - 1) + 1) - *from;
 }
 
 /* Half the negative logarithm of the determinant of the correlations of all that is fitted of k echoes: those that share
@@ -122,7 +122,7 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
         innovate(w, row, vectors);
     }
     multiply_rows(p, vectors, d->rows, d->gram);
-    for (int64_t r = 0; r < p; r++) d->column[r] = 1 / sqrt(fmax(d->gram[r * p + r], 1e-12));
+    for (int64_t r = 0; r < p; r++) d->column[r] = 1 / sqrt(at_least(d->gram[r * p + r], 1e-12));
     for (int64_t r = 0; r < p; r++)
         for (int64_t c = 0; c <= r; c++)
             d->matrix[r * p + c] = d->gram[r * p + c] * d->column[r] * d->column[c] + (r == c ? NEARLY_SINGULAR : 0);
@@ -130,7 +130,7 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
     for (int64_t r = 0; r < p; r++) {
         for (int64_t c = 0; c < p; c++) d->column[c] = c == r;
         solve_part(p, d->matrix, d->column, r, r);
-        sum += 0.5 * (log_double(fmax(d->column[r], 1)) + log_double(fmin(d->pivot[r], 2)));
+        sum += 0.5 * (log_double(at_least(d->column[r], 1)) + log_double(at_most(d->pivot[r], 2)));
     }
     return sum;
 }
@@ -158,7 +158,7 @@ static void find_bend(const Described *w, Desk *d, int64_t echo, Bend *bend) {
         }
         double norm = sqrt(multiply(vectors, row, row));
         if (!r) energy = norm;
-        for (int64_t v = 0; v < vectors; v++) row[v] *= (float)(1 / fmax(norm, 1e-9));
+        for (int64_t v = 0; v < vectors; v++) row[v] *= (float)(1 / at_least(norm, 1e-9));
     }
     for (int64_t r = 0; r < 2; r++) {
         lanes *row = bend->rows + r * vectors;
@@ -289,7 +289,7 @@ EXPORT int64_t describe_widths(int64_t n, const double *ratio, const double *err
             for (int64_t i = 0; i < n; i++) {
                 if (!known[i]) continue;
                 const lanes *own = density + i * vectors;
-                const float whole = 1 / fmaxf(multiply(vectors, own, share), 1e-30f);
+                const float whole = 1 / (float)at_least(multiply(vectors, own, share), 1e-30f);
                 for (int64_t v = 0; v < vectors; v++) next[v] += own[v] * whole;
             }
             for (int64_t v = 0; v < vectors; v++) share[v] = (next[v] * share[v] + 0.5f) * (float)(1 / (number + 0.5 * laws));
@@ -337,7 +337,7 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
             low[c] = vectors; high[c] = 0;
             for (int64_t j = first; j < end; j++) {
                 double wide = w->width[j], more = wide * wide - reference * reference;
-                double sigma = sqrt(fmax(variance[c] + more, NARROWEST * variance[c]));
+                double sigma = sqrt(at_least(variance[c] + more, NARROWEST * variance[c]));
                 double place = w->time[j] + delay[c];
                 float whole = rint(place), part = place - rint(place), inverse = 1 / sigma, height = w->amplitude[j] * wide / sigma;
                 int64_t from = at_most(at_least(place - REACH * sigma, 0), w->length) / LANES;

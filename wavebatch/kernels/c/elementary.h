@@ -32,7 +32,7 @@ EXPORT int64_t solve_equations(int64_t n, int64_t m, double *matrix, double *rig
 }
 
 /* m columns of a table of k rows, (k, m), linear between its ascending abscissas and level beyond: as NumPy's interp. */
-static void interpolate_row(double x, int64_t k, int64_t m, const double *at, const double *table, double *out) {
+static void interpolate_row(double x, int64_t k, int64_t m, const double *at, const double *table, double *restrict out) {
     int64_t low = 0, high = k;                 /* the last row at or before x */
     while (high - low > 1) {
         int64_t middle = (low + high) / 2;
@@ -41,8 +41,8 @@ static void interpolate_row(double x, int64_t k, int64_t m, const double *at, co
     }
     const double *here = table + low * m;
     const int level = x <= at[low] || low + 1 == k;
-    for (int64_t c = 0; c < m; c++)
-        out[c] = isnan(x) ? x : level ? here[c] : (here[m + c] - here[c]) / (at[low + 1] - at[low]) * (x - at[low]) + here[c];
+    const double step = level ? 1 : at[low + 1] - at[low], way = x - at[low];
+    for (int64_t c = 0; c < m; c++) out[c] = isnan(x) ? x : level ? here[c] : (here[m + c] - here[c]) / step * way + here[c];
 }
 
 EXPORT int64_t interpolate_columns(int64_t n, const double *x, int64_t k, int64_t m, const double *at, const double *table, double *out) {

@@ -223,7 +223,7 @@ INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *
         find_products(rows, work, work->products);
         double cost = work->products[n * rows + n] + add_prior(k, per, &fit->prior, std, trial, work->products), before = fit->cost;
         int accepted = iteration == 0 || cost <= fit->cost * (1 + 1e-6);
-        if (iteration) damping = fmax(damping * (!accepted ? raise : fit->cost - cost > KEPT * promised ? EASE : 1), 1e-7);
+        if (iteration) damping = at_least(damping * (!accepted ? raise : fit->cost - cost > KEPT * promised ? EASE : 1), 1e-7);
         raise = accepted ? RAISE : 2 * raise;
         if (accepted) {
             memcpy(fit->parameters, trial, n * sizeof(double));
@@ -272,7 +272,7 @@ static void fit_undamped(int64_t k, const Settings *s, const Limits *limits, Wor
         fit->converged = is_sane && promise < s->tolerance * std * std;
     }
     if (!is_sane) memcpy(p, start, n * sizeof(double));
-    for (int64_t j = 2 * k; j < n; j++) p[j] = fmin(fmax(p[j], limits->low[2]), limits->high[2]);
+    for (int64_t j = 2 * k; j < n; j++) p[j] = at_most(at_least(p[j], limits->low[2]), limits->high[2]);
     evaluate_rows(k, 3, s, work, p);
     find_products(rows, work, fit->gram);
     fit->cost = fit->gram[n * rows + n] / (std * std);

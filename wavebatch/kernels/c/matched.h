@@ -19,7 +19,7 @@ EXPORT int64_t find_correlated(const Block *b, int64_t n, const Detector *d, int
             if (b->missing && !(gap_distance(b, w, out->time[here]) > -1)) continue;
             start_of(s, r.smoothed, i, &amplitude, &time, &width);
             out->waveform[here] = w;
-            out->width[here++] = fmin(fmax(width, 0.8 * ref), 2 * ref);
+            out->width[here++] = at_most(at_least(width, 0.8 * ref), 2 * ref);
         }
         if (here == out->room) break;
         total = here;

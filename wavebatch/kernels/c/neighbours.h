@@ -96,7 +96,7 @@ EXPORT int64_t weigh_fits(const Table *t, const Unexplained *u, double *unexplai
                 double left = 0;
                 if (k == j) continue;
                 if (u->left.n && strong > (float)u->clear && fabs(lag) < u->beside) interpolate_row(lag, u->left.n, 1, u->left.lag, u->left.value, &left);
-                beside[j] = fmax(beside[j], (float)u->energy * (core * core) + left);
+                beside[j] = at_least((float)u->energy * (core * core) + left, beside[j]);
             }
         }
     }
@@ -126,7 +126,7 @@ static void set_flags(const Table *t, const Block *b, const Flagging *f) {
         const float reach = (float)f->reach * sigma;
         int set = (amplitude < 5 * b->std[waveform] ? FLAG_WEAK : 0) | ((time < rest ? time : rest) < sigma ? FLAG_NEAR_EDGE : 0);
         if (sigma + 3 * error < (float)f->sigma_ref && sigma < (float)f->narrow) set |= FLAG_NARROW;
-        const double low = ceil(fmin(fmax((time - reach) / f->spacing, 0), s)), high = floor(fmin(fmax((time + reach) / f->spacing, -1), s - 1));
+        const double low = ceil(at_most(at_least((time - reach) / f->spacing, 0), s)), high = floor(at_most(at_least((time + reach) / f->spacing, -1), s - 1));
         if (is_clipped(b, waveform, (int64_t)low, (int64_t)high, level))
             set |= FLAG_SATURATED | ((float)f->unreliable * amplitude > (float)f->level - b->baseline[waveform] ? FLAG_UNRELIABLE : 0);
         t->flags[i] |= set;

@@ -39,8 +39,8 @@ static void hermite_moments(Work *work, const Fit *fit) {
         find_directions(w, time, inverse, row, 0, third, fourth);
         take_level_off(w, 1, third);
         take_level_off(w, 1, fourth);
-        work->h3[j] = multiply(n, third, residual) / sqrt(fmax(multiply(n, third, third), 1e-12)) / w->std;
-        work->h4[j] = multiply(n, fourth, residual) / sqrt(fmax(multiply(n, fourth, fourth), 1e-12)) / w->std;
+        work->h3[j] = multiply(n, third, residual) / sqrt(at_least(multiply(n, third, third), 1e-12)) / w->std;
+        work->h4[j] = multiply(n, fourth, residual) / sqrt(at_least(multiply(n, fourth, fourth), 1e-12)) / w->std;
     }
 }
 
@@ -79,7 +79,7 @@ static void whitened_moments(const Settings *s, Work *work, const Fit *fit) {
             const double all = multiply(n, direction, direction);
             take_rows_off(work, p, direction);
             if (q) {
-                const float share = multiply(n, third, fourth) / fmax(multiply(n, third, third), 1e-12);
+                const float share = multiply(n, third, fourth) / at_least(multiply(n, third, third), 1e-12);
                 for (int64_t v = 0; v < n; v++) fourth[v] -= third[v] * share;
             }
             const double left = multiply(n, direction, direction);
@@ -122,11 +122,11 @@ static int is_whitened_misfit(const Settings *s, Work *work, const Fit *fit) {
     const Window *w = &work->window;
     const float *share = (const float *)work->about, *energy = (const float *)work->new_energy;
     double shape = 0, highest = 0;
-    for (int64_t j = 0; j < fit->k; j++) shape = fmax(shape, work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j]);
+    for (int64_t j = 0; j < fit->k; j++) shape = at_least(work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j], shape);
     filter_back(w, work->rows + 3 * fit->k * w->vectors, work->back);
     correlate(work, work->back, work->taps, work->about);
     for (int64_t i = 1; i + 1 < w->n; i++)
-        if (share[i] > 0 && energy[i] > 0) highest = fmax(highest, (double)share[i] * share[i] / energy[i]);
+        if (share[i] > 0 && energy[i] > 0) highest = at_least((double)share[i] * share[i] / energy[i], highest);
     return highest > s->gate_residual * s->gate_residual * w->std * w->std || shape > s->gate_hermite;
 }
 
@@ -140,7 +140,7 @@ static int is_misfit(const Settings *s, Work *work, const Fit *fit) {
         const float height = residual[i - 1] + residual[i + 1] + 2 * residual[i];
         highest = height > highest ? height : highest;
     }
-    for (int64_t j = 0; j < fit->k; j++) shape = fmax(shape, work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j]);
+    for (int64_t j = 0; j < fit->k; j++) shape = at_least(work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j], shape);
     return 0.25 * highest > s->gate_residual * SMOOTH_GAIN * w->std || shape > s->gate_hermite;
 }
 
@@ -236,8 +236,8 @@ static double split_flat(const Settings *s, const Work *work, const Fit *fit, do
         if (gain > promise) { promise = gain; echo = j; }
     }
     if (echo < 0) return promise;
-    double amplitude = p[echo], time = p[k + echo], broad = p[2 * k + echo], narrow = fmin(broad, 1.1 * s->width_ref);
-    double apart = fmax(sqrt(broad * broad - narrow * narrow), 0.5 * broad), half = 0.5 * amplitude * broad / narrow;
+    double amplitude = p[echo], time = p[k + echo], broad = p[2 * k + echo], narrow = at_most(broad, 1.1 * s->width_ref);
+    double apart = at_least(sqrt(broad * broad - narrow * narrow), 0.5 * broad), half = 0.5 * amplitude * broad / narrow;
     double first[3] = {half, time - apart, narrow}, second[3] = {half, time + apart, narrow};
     for (int64_t q = 0; q < 3; q++) {
         memcpy(next->parameters + q * (k + 1), p + q * k, k * sizeof(double));
@@ -286,13 +286,13 @@ static double propose_echo(const Settings *s, Work *work, const Fit *fit, const 
     for (int64_t j = 0; j < k; j++) {
         double a = fit->parameters[j], time = fit->parameters[k + j], width = fit->parameters[2 * k + j];
         double unit = -amplitude * unit_of(k, k + j, fit->parameters, w->std);
-        next->parameters[j] = fmax(a - change[j] * amplitude, 0.2 * a);
-        next->parameters[k + 1 + j] = time + fmin(fmax(change[k + j] * unit, -s->width_ref), s->width_ref);
-        next->parameters[2 * k + 2 + j] = width + fmin(fmax(change[2 * k + j] * unit, -0.4 * width), 0.3 * width);
+        next->parameters[j] = at_least(a - change[j] * amplitude, 0.2 * a);
+        next->parameters[k + 1 + j] = time + at_most(at_least(change[k + j] * unit, -s->width_ref), s->width_ref);
+        next->parameters[2 * k + 2 + j] = width + at_most(at_least(change[2 * k + j] * unit, -0.4 * width), 0.3 * width);
     }
     next->parameters[k] = amplitude; next->parameters[2 * k + 1] = place; next->parameters[3 * k + 2] = s->width_ref;
     double promise = split_flat(s, work, fit, best / (w->std * w->std), next);
     for (int64_t i = 0; i < 3 * k + 3; i++)
-        next->parameters[i] = fmin(fmax(next->parameters[i], limits->low[i / (k + 1)]), limits->high[i / (k + 1)]);
+        next->parameters[i] = at_most(at_least(next->parameters[i], limits->low[i / (k + 1)]), limits->high[i / (k + 1)]);
     return promise;
 }

@@ -205,9 +205,9 @@ static void start_of(int64_t s, const float *y, int64_t place, double *amplitude
     double shift = c2 < -1e-4 ? -c1 / (2 * c2) : 2;
     *time = place; *amplitude = 1.1 * peak;
     if (!(fabs(shift) < 1.5)) return;
-    double narrow = sqrt(fmax(-1 / (2 * c2) - 0.5, 0.1));
+    double narrow = sqrt(at_least(-1 / (2 * c2) - 0.5, 0.1));
     *time = place + shift;
-    *amplitude = exp_double(fmin(fmax(c0 - c1 * c1 / (4 * c2), -20), 20)) * sqrt(1 + 0.5 / (narrow * narrow));
+    *amplitude = exp_double(at_most(at_least(c0 - c1 * c1 / (4 * c2), -20), 20)) * sqrt(1 + 0.5 / (narrow * narrow));
     *width = narrow;
 }
 
@@ -217,7 +217,7 @@ static void refine_peak(int64_t s, const float *y, int64_t place, double *amplit
     if (place == 0 || place == s - 1 || !(y[place - 1] > 0 && y[place + 1] > 0)) return;
     double a = log_double(y[place - 1]), b = log_double(y[place]), c = log_double(y[place + 1]), curve = a - 2 * b + c;
     if (!(curve < -1e-12)) return;
-    double shift = fmin(fmax(0.5 * (a - c) / curve, -0.5), 0.5);
+    double shift = at_most(at_least(0.5 * (a - c) / curve, -0.5), 0.5);
     *time = place + shift;
     *amplitude = exp_double(b - 0.25 * (a - c) * shift);
 }
@@ -271,16 +271,16 @@ EXPORT int64_t find_maxima(const Block *b, int64_t n, const Detector *d, int64_t
         double after = INFINITY;
         for (int64_t j = here - 1; j >= total; j--) {
             int64_t place = (int64_t)out->time[j];
-            double before = j > total ? place - out->time[j - 1] : INFINITY, gap = fmin(before, after), width = ref;
+            double before = j > total ? place - out->time[j - 1] : INFINITY, gap = at_most(before, after), width = ref;
             after = before;
             start_of(s, r.smoothed, place, &out->amplitude[j], &out->time[j], &width);
             if (gap < 4 * ref) refine_peak(s, r.smoothed, place, &out->amplitude[j], &out->time[j]);
-            width = fmin(width, 0.5 * gap);
+            width = at_most(width, 0.5 * gap);
             if (d->broad > 0) {
-                width = sqrt(fmax(width * width - d->broad * d->broad, 0.25 * ref * ref));
+                width = sqrt(at_least(width * width - d->broad * d->broad, 0.25 * ref * ref));
                 out->amplitude[j] *= sqrt(1 + d->broad * d->broad / (width * width));
             }
-            out->width[j] = fmin(fmax(width, 0.7 * ref), 4 * ref);
+            out->width[j] = at_most(at_least(width, 0.7 * ref), 4 * ref);
         }
         total = here;
     }
@@ -298,7 +298,7 @@ typedef struct { int64_t *waveform, *low, *high, *first, *number; } Groups;
 static void find_extents(int64_t s, const float *smoothed, float level, int64_t m, const double *time, const int64_t *tail, int64_t *at,
                          int64_t *low, int64_t *high) {
     for (int64_t i = 0; i < m; i++) {
-        int64_t place = (int64_t)rint(fmin(fmax(time[i], 0), s - 1)), begin = place, end = place + 1;
+        int64_t place = (int64_t)rint(at_most(at_least(time[i], 0), s - 1)), begin = place, end = place + 1;
         if (smoothed[place] > level) {
             if (i && place < high[i - 1] && place >= low[i - 1]) { begin = low[i - 1]; end = high[i - 1]; } /* the same run */
             while (begin > 0 && smoothed[begin - 1] > level) begin--;
@@ -390,7 +390,7 @@ EXPORT int64_t explain_tails(int64_t m, const int64_t *waveform, const double *t
             if (!before && !behind) break;
         }
         kept[i] = amplitude[i] - expected > FAR_ABOVE * noise + 0.5 * expected || expected <= quiet * noise;
-        const double least = 1 / fmax(amplitude[i] / noise, 1e-9);
+        const double least = 1 / at_least(amplitude[i] / noise, 1e-9);
         int64_t low = 0, high = t->n - t->after; /* the first lag from which the tail is in the noise */
         while (low < high) {
             const int64_t middle = (low + high) / 2;
