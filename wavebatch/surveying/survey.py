@@ -26,6 +26,7 @@ from wavebatch.surveying.measuring.misfit import (
     MISFIT_PEAK,
     MOST_FAINT,
     STEP_OF_MISFITS,
+    cover_faint,
     cover_fits,
     cover_repeated,
     find_parts,
@@ -306,7 +307,7 @@ def _survey(
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_again(part, system, borne, echoes)
-        # From here on the misfit alone is raised: `faint_share` stays as the description's misfit asks for.
+        # From here on the misfit alone is raised: twice or four times of it as `faint_share` lost echoes of canopies.
         misfit, left = cover_fits(system, echoes, block.spacing)
         if misfit > system.misfit:
             system = replace(system, misfit=misfit)
@@ -319,6 +320,8 @@ def _survey(
         repeated_share = share_repeated(echoes, system.sigma_ref)
         if repeated_share > MOST_DOUBTED:
             system, echoes = cover_repeated(part, system, echoes)
+        if (covered := cover_faint(system, echoes)) is not system:
+            system, echoes = covered, decompose_sample(part, covered)
         fixed_share = share_fixed(echoes, len(part), block.spacing)
         figures.width_in_doubt = choice.spread
         # Neighbours too close to be found stay in the mirror too, but never beside so many of the strong echoes.

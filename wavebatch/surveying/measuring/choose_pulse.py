@@ -501,23 +501,20 @@ def _need_saved(shorter: Candidate, longer: Candidate) -> float:
 
 
 def _beats(shorter: Candidate, longer: Candidate) -> bool:
-    """Whether a candidate describes so much shorter that it is taken in place of the other."""
+    """Whether a candidate describes so much shorter, in nats per echo and in standard errors, that it is taken in place
+    of the other."""
     if _save(shorter, longer) <= _need_saved(shorter, longer):
         return False
-    return longer.exceeds(shorter) > _bound_errors(shorter, longer)
-
-
-def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
-    """Standard errors by which a candidate must describe shorter to be taken in place of the other."""
-    if longer.answered < BLIND * shorter.answered:
-        return HINT
     most = max(SHOWN * float(np.sqrt(max(shorter.answered, longer.answered))), HINT)
     fewer = float(np.clip((1 - shorter.echoes / max(longer.echoes, 1)) / (1 - FEWER), -1.0, 1.0))
-    if longer.known:
-        return min(SURE - HINT * min(fewer, 0.0), most)
     doubtful = AS_FEW * shorter.echoes <= longer.echoes and longer.gaussians > 1
     doubtful |= longer.missed > max(COVERED * longer.change, shorter.missed)
-    return HINT if doubtful else min(SURE - HINT * fewer, most)
+    blind = longer.answered < BLIND * shorter.answered
+    if blind or (doubtful and not longer.known):
+        errors = HINT
+    else:
+        errors = min(SURE - HINT * (min(fewer, 0.0) if longer.known else fewer), most)
+    return longer.exceeds(shorter) > errors
 
 
 def settle(

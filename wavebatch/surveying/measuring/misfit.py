@@ -145,6 +145,10 @@ strip; and step by which they are raised."""
 MOST_FAINT = SystemPulse(1.0).faint_share
 """What a pulse of which no more is known may leave beside strong echoes."""
 
+FAINT_REACH, NEARER = 4.0, 2.0
+"""Widths of the pulse within which echoes may be faint, as in `stages.flags.unproven`; and how many more of them than
+as far beyond are no targets: of targets some half are so near, as they are found less often there."""
+
 
 def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> SystemPulse:
     """The system with the `faint_share` that its misfit and its noise leave, where that is less than it has.
@@ -166,6 +170,35 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
         return system
     seen = ABOVE_NOISE * system.noise.std / max(quantile(echoes.amplitude, 0.99), 1e-9)
     return replace(system, faint_share=min(max(MISFIT_PEAK * max(system.misfit, change), seen), system.faint_share))
+
+
+def cover_faint(system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+    """The system with a `faint_share` above that of echoes that stand nearer to far stronger ones than targets do.
+
+    A tail that changes from shot to shot leaves such echoes, all within FAINT_REACH. Targets are as often further off.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        With the `faint_share` that misfit and noise leave.
+    echoes : EchoTable
+        Of a sample, decomposed with it.
+
+    Returns
+    -------
+    SystemPulse
+    """
+    row, other, distance = _list_distances(echoes, system.sigma_ref)
+    ratio = echoes.amplitude[row] / echoes.amplitude[other]
+    faint = ratio < MOST_FAINT
+    nearest = np.full(len(echoes), np.inf)
+    np.minimum.at(nearest, row[faint], distance[faint])
+    near = np.count_nonzero(nearest <= FAINT_REACH)
+    far = np.count_nonzero(nearest <= 2 * FAINT_REACH) - near
+    if near < FEW or near - NEARER * far < SURE * np.sqrt(near + NEARER**2 * far):
+        return system
+    share = quantile(ratio[faint & (distance <= FAINT_REACH)], 0.95)
+    return replace(system, faint_share=min(max(share, system.faint_share), MOST_FAINT))
 
 
 def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[float, float]:
@@ -193,7 +226,7 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     if np.count_nonzero(clear) < FEW:
         return system.misfit, 0.0
-    row, distance = _list_distances(echoes, system.sigma_ref)
+    row, _, distance = _list_distances(echoes, system.sigma_ref)
     apart = np.count_nonzero(clear[row] & (distance >= APART[0]) & (distance < APART[1]))
     hidden = UNEXPLAINED * min(apart / np.count_nonzero(clear) / NEIGHBOURS, 1.0)
     alone = clear & echoes.alone(int(echoes.waveform.max()) + 1)
@@ -228,7 +261,7 @@ def suspect_pairs(echoes: EchoTable, width: float) -> bool:
     """
     doubtful = (echoes.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
     doubtful &= echoes.amplitude < JUST * PROVEN * echoes.amplitude_err
-    row, distance = _list_distances(echoes, width)
+    row, _, distance = _list_distances(echoes, width)
     proven = np.count_nonzero(doubtful[row] & (distance < APART[0]))
     apart = np.count_nonzero((distance >= APART[0]) & (distance < APART[1]))
     return bool(proven > MOST_PROVEN * apart / 2)
@@ -343,13 +376,13 @@ def share_fixed(echoes: EchoTable, number: int, spacing: float) -> float:
     return float(np.mean(here)) if others else 0.0
 
 
-def _list_distances(echoes: EchoTable, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of echoes that have a neighbour, and its distance [widths]: each pair from both sides."""
-    pairs = [(row, np.abs(lag) / width) for row, _, lag in list_neighbours(echoes)]
+def _list_distances(echoes: EchoTable, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of echoes that have a neighbour, its row, and its distance [widths]: each pair from both sides."""
+    pairs = [(row, other, np.abs(lag) / width) for row, other, lag in list_neighbours(echoes)]
     if not pairs:
-        return np.empty(0, np.int64), np.empty(0)
-    row, distance = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    return row, distance
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    row, other, distance = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return row, other, distance
 
 
 def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -> SystemPulse:
