@@ -44,10 +44,11 @@ assumed, since no figure was found): 20 % from edge to edge, as of a dirty windo
 SUNLIGHT = 0.1
 """By how much sunlight changes the noise of one gain (standard deviation of the logarithm)."""
 
-PLACES, NEAR, LEAST_COMMON, SPAN, BORDER = 256, 20.0, 20, 0.25, 4.0
+PLACES, NEAR, LEAST_COMMON, BESIDE, SPAN, BORDER = 256, 20.0, 20, 2.0, 0.25, 4.0
 """Places that a calibration keeps; distance up to which a waveform of another strip sees the same ground [m], since
-fields are larger; fewest of these that show a change; how far they spread along the strip to show that it fades
-(standard deviation, in half of its time); and standard deviations of their differences from which they lie apart."""
+fields are larger; fewest of these that show a change; times the middle distance up to which they count; how far they
+spread along the strip to show that it fades (standard deviation, in half of its time); and standard deviations of their
+differences from which they lie apart."""
 
 SAME_GROUND = 0.02
 """By how much ground changes its brightness between two strips, by moisture and the direction of their light (standard
@@ -275,9 +276,12 @@ def compare_ground(
     if not (there.size and places.size):
         return None
     apart = np.hypot(*(there[:2, :, None] - places[:2, None]))
-    near = apart.argmin(axis=1)
-    rows = np.flatnonzero(apart.min(axis=1) < NEAR)
-    if len(np.unique(near[rows])) < LEAST_COMMON:
+    near, distance = apart.argmin(axis=1), apart.min(axis=1)
+    # Beyond the edge of the strip places have neighbours on other ground, and one neighbour for many places.
+    rows = np.argsort(distance, kind="stable")[: np.count_nonzero(distance < NEAR)]
+    rows = rows[distance[rows] <= BESIDE * distance[rows[len(rows) // 2 :][:1]].sum()]
+    rows = rows[np.unique(near[rows], return_index=True)[1]]
+    if len(rows) < LEAST_COMMON:
         return None
     light, time, side = places[2:, near[rows]]
     off, whole = light - there[2, rows], np.hypot(robust_std(light), robust_std(there[2, rows]))
@@ -285,8 +289,8 @@ def compare_ground(
         return None
     # Warming up, or failing for a time, moves parts of the strip.
     found = []
-    for order in (np.argsort(time, kind="stable"), np.argsort(side, kind="stable")):
-        parts = np.array_split(off[order], len(np.unique(near[rows])) // LEAST_COMMON)
+    for order in (np.argsort(one, kind="stable") for one in (time, side)):
+        parts = np.array_split(off[order], len(off) // LEAST_COMMON)
         middles = np.array([float(np.sort(part)[len(part) // 4 : -(len(part) // 4)].mean()) for part in parts])
         rest = np.concatenate([part - middle for part, middle in zip(parts, middles, strict=True)])
         rest = np.clip(rest, -BORDER * robust_std(rest), BORDER * robust_std(rest))
@@ -295,8 +299,8 @@ def compare_ground(
     uneven, across = found[0], found[1]._replace(shift=float(np.quantile(np.abs(middles), 0.68)))
     # Neighbours on two sides of a field's border say nothing.
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
-    off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
-    error, spread = float(np.std(off)) / number**0.5, float(np.std(time))
+    off, time = off[same], time[same]
+    error, spread = float(np.std(off)) / len(off) ** 0.5, float(np.std(time))
     doubt = float(np.hypot(MEDIAN_ERROR * error, SAME_GROUND))
     level = weigh_change(float(np.median(off)), doubt, noise, chance=chance, usual=usual)
     if spread < SPAN:
@@ -330,7 +334,7 @@ def measure_setting(
         off, (level, across) = time - 0.5 * (time.min() + time.max()), _level(rows, right)
         places[channel] = np.stack([east, north, np.log(level), off / max(float(off.max()), 1e-9), across])
         width = max(width, float(np.std(across)))
-        fading.append(_find_fading(time, light, rows[2:4], chance=chance))
+        fading.append(_find_fading(time, light, rows[2:4], chance=0.5 * chance))
         lines = _compare_lines(time, np.log(light), rows[2:4], chance=chance)
         fading += [lines] if lines.chance > LIKELY else []
         sides += [_find_sides(level, across, rows[2:4], chance=chance)] if straight >= LEAST_STRAIGHT else []
