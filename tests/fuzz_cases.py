@@ -152,8 +152,8 @@ def test_a_failing_case_is_made_small(fuzzer):
     planted.close()
 
 
-@pytest.mark.quick_cases("80")
-@pytest.mark.parametrize("number", [80, 600])
+@pytest.mark.quick_cases("30")
+@pytest.mark.parametrize("number", [30, 600])
 def test_damaged_inputs_break_no_promise(fuzzer, number):
     fresh = Fuzzer(fuzzer.base.parent)
     assert fuzz(fresh, number, int(os.environ.get("FUZZ_SEED", "1")), set(), float("inf")) is None

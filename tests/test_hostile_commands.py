@@ -95,7 +95,7 @@ def test_a_cloud_that_seems_to_hold_more_points_is_named_by_all_that_read_it(tmp
     line = "the header claims .* which leaves room for 50 more"
     for words in (
         "plot histogram out/a.las --column amplitude -o a.png", "compare out/a.las out/a.las",
-        "compare --strip a.las fast balanced", "plot waveform a.las -o b.png", "synthesize out/a.las -o c.las",
+        "compare --strip a.las fast balanced", "plot waveform a.las -o b.csv", "synthesize out/a.las -o c.las",
     ):  # fmt: skip
         said = succeed(*(tmp_path / word if word[-4:-3] == "." else word for word in words.split())).stderr
         assert re.search(f"warning: .*{line}", said), (words, said)

@@ -225,7 +225,7 @@ def test_every_warning_has_a_listed_code():
     package = Path(wavebatch.__file__).parent
     text = "\n".join(path.read_text() for path in package.rglob("*.py") if path.name != "errors.py")
     used = re.findall(r'(?:StripWarning|StripWarning\.of|warn)\(\s*"([^"]+)"|code, guess = "([^"]+)"', text)
-    used = {one or other for one, other in used} | {"header", "lost-packets", "lost-samples", "packets"}
+    used = {one or other for one, other in used} | {"header", "lost-packets", "lost-samples", "packets", "repeated"}
     page = (package.parent / "docs" / "json.md").read_text()
     listed = dict(re.findall(r"(?m)^\| `([a-z-]+)` \| ([^|]+) \|$", page.split("### Codes of warnings")[1]))
     assert used == set(WARNINGS) and {code: listed[code] for code in WARNINGS} == WARNINGS

@@ -259,6 +259,7 @@ def test_returns_off_their_ray_are_in_the_error_and_in_a_line(tmp_path, edit_poi
     assert np.median(after[number == 2]) > 10.0 * np.median(before[number == 2])
 
 
+@pytest.mark.quick_cases("later", "mirrored")
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [

@@ -365,6 +365,7 @@ def test_any_tie_of_returns_to_packets_makes_them_own(rng, location, intensity):
     assert is_strange(table) == (not location and not intensity)
 
 
+@pytest.mark.quick_cases("urban")
 @pytest.mark.parametrize("scene", ["forest", "urban", "slope", "canopy.gemini-24"])
 def test_packets_of_a_stretch_that_are_not_theirs_are_named(strips, tmp_path, scene):
     """A part of a .wdp that was written twice, or without one packet: 14 % of a strip were wrong without a word."""
@@ -581,6 +582,7 @@ def test_points_may_say_anything_about_their_packets(tmp_path, damage):
         assert len(seen) == len(set(seen.tolist())) == scan.packets
 
 
+@pytest.mark.quick_cases("10-.laz")
 @pytest.mark.parametrize(("point_format", "suffix"), [(4, ".las"), (10, ".laz"), (9, ".las")])
 def test_geometry_of_damaged_strips_is_finite(tmp_path, point_format, suffix):
     """What the fuzzer does not see: rays and returns of every packet that is still read."""

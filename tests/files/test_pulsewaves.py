@@ -99,6 +99,7 @@ def test_cut_pulses_are_one_line(tmp_path, rng):
         assert "\n" not in str(caught.value) and str(caught.value).startswith(str(path))
 
 
+@pytest.mark.quick_cases("0")
 @pytest.mark.parametrize("seed", range(3))
 def test_changed_bytes_are_read_or_are_one_line(tmp_path, seed):
     rng = np.random.default_rng(seed)

@@ -83,7 +83,7 @@ def _shuffled(tmp_path, points, order):
     return path
 
 
-@pytest.mark.quick_cases("reversed-16384", "by return-300", "random-300", "halves-64")
+@pytest.mark.quick_cases("random-300", "halves-64")
 @pytest.mark.parametrize("window", [16_384, 300, 64])
 @pytest.mark.parametrize("order", ["reversed", "by return", "random", "halves"])
 def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, order, window):

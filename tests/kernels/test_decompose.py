@@ -141,10 +141,10 @@ def test_echoes_that_a_fit_missed_are_searched_again():
     missed = plain.cost > 9 * 15 + LENGTH
     assert missed.mean() > 0.1 and np.mean(found.cost > 9 * 15 + LENGTH) < 0.01
     # Fits so stiff end at another minimum by a rounding: that of the twin is found as often.
-    rows = np.flatnonzero(missed)[:4]
+    rows = np.flatnonzero(missed)[:2]
     twin = [naive_fit.decompose(y[i], 1.0, start[i], settings(grow=True, thorough=True, **options)) for i in rows]
-    assert sum(chi2 < 9 * 15 + LENGTH for _, _, chi2 in twin) >= 3
-    assert sum(p.shape[1] == found.number[i] for (p, _, _), i in zip(twin, rows, strict=True)) >= 3
+    assert sum(chi2 < 9 * 15 + LENGTH for _, _, chi2 in twin) == 2
+    assert sum(p.shape[1] == found.number[i] for (p, _, _), i in zip(twin, rows, strict=True)) == 2
 
 
 def test_what_a_fit_leaves_is_counted_about_each_echo():
@@ -236,7 +236,7 @@ def draw_broad(rng):
     [(0.0, (), None), (3.0, (), None), (3.0, (1.1, -0.4), None), (0.0, (), 0.7), (3.0, (1.1, -0.4), 0.7)],
 )
 def test_clusters_grow_as_those_of_the_twin(shape, draw, clip, known, whitening, level_err):
-    rng, m = np.random.default_rng(5), {draw_crowd: 20, draw_broad: 2}.get(draw, 30)  # the twin takes long
+    rng, m = np.random.default_rng(5), {draw_crowd: 20, draw_broad: 1}.get(draw, 30)  # the twin takes long
     truth = [draw(rng) for _ in range(m)]
     y = np.stack([naive_fit.naive.model(p, np.arange(float(LENGTH)), components=shape.components) for p in truth])
     noise = rng.standard_normal(y.shape)

@@ -16,6 +16,7 @@ def detect(image, sigma=8.0, **options):
     return find_lines(column.astype(float), row.astype(float), image[roi], sigma=sigma, **options)
 
 
+@pytest.mark.quick_cases("0.0", "1.0", "-0.7")
 @pytest.mark.parametrize("slope", [0.0, 0.1, 0.2, 0.5, 1.0, -0.7])
 def test_position_and_angle_meet_the_acceptance(slope):
     off, turn = [], []

@@ -82,6 +82,7 @@ def pairs_of_returns(first, last):
     return 0.5 * (first + last), apart, np.einsum("ni,ni->n", apart, apart)
 
 
+@pytest.mark.quick_cases("*-4000-*")
 @pytest.mark.parametrize(
     ("apart", "rate", "position", "distance"),
     [

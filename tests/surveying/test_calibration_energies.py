@@ -288,6 +288,7 @@ def scale(wave):
     return 200.0 * wave / wave.max(axis=1, keepdims=True)
 
 
+@pytest.mark.quick_cases("follow-0.12", "None-0.0")
 @pytest.mark.parametrize(("receive", "least"), [(follow, 0.12), (scale, 0.5), (None, 0.0)])
 def test_a_gain_that_follows_the_light_is_named_and_in_the_error(tmp_path, flickering, receive, least):
     """Values were 15 and 35 % off with 4 % of error, in silence."""

@@ -54,6 +54,7 @@ def test_what_is_hidden_changes_errors_and_no_echo():
     assert 0.5 < max(share for _, *shares in system.hidden_light for share in shares) < 1.3
 
 
+@pytest.mark.quick_cases("forest-3000")
 @pytest.mark.parametrize(("scene", "pulses"), [("canopy.corn", 6000), ("forest", 3000)])
 def test_errors_of_widths_hold_what_hidden_neighbours_add(scene, pulses):
     """Widths of the strip hold them too: pairs drawn from these said too little (lone echoes of corn: 47 %)."""

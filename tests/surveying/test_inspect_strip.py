@@ -130,6 +130,7 @@ def _lift(points):
     points["Z"] += 300_000
 
 
+@pytest.mark.quick_cases("_swap_axes-0.2")
 @pytest.mark.parametrize(("change", "share"), [(_swap_axes, 0.2), (_lift, 1.0)])
 def test_points_far_outside_the_bounds_of_the_header_are_named(tmp_path, tiny_strip, edit_points, change, share):
     """A stretch with swapped axes, or 300 m too high, was decomposed without a word."""

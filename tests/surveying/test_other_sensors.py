@@ -365,6 +365,7 @@ def test_a_pulse_whose_echoes_repeat_another_width_must_be_shorter_for_sure(
     assert choice.best.name == taken and choice.spread == pytest.approx(spread, abs=0.005) and len(choice.tried) == 2
 
 
+@pytest.mark.quick_cases("160-1-gaps1-6-6-4", "40-*")
 @pytest.mark.parametrize(
     ("n", "seed", "gaps", "echoes", "number", "taken"),
     [(160, 1, (1.2, 2.5), 3, 10, 9), (160, 1, (1.2, 2.5), 6, 6, 4), (40, 10, (1.2, 2.5), 3, 4, 3)],

@@ -675,6 +675,7 @@ def test_strips_that_were_wrong_in_silence_are_right(number, tmp_path):
     assert result["right"] and not result["doubts"] and result["extra"] < 0.012 and result["missed"] < 0.006
 
 
+@pytest.mark.quick_cases("5577")
 @pytest.mark.parametrize("number", [2183, 5577])
 def test_strips_that_are_wrong_are_doubted(number, tmp_path):
     """Undershoots that count 0 cuts off: the mirror has false echoes beside a fifth of the strong ones. And 59 packets

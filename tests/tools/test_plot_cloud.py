@@ -339,6 +339,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.quick_cases(".png-*", ".svg-*")
 @pytest.mark.parametrize(("suffix", "start"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")])
 def test_pictures_have_the_same_bytes_each_time(tmp_path, cloud, suffix, start):
     target, made = tmp_path / f"a{suffix}", set()

@@ -488,6 +488,7 @@ def test_measured_widths_come_first(cloud, tmp_path):
     assert np.percentile(above, 10) >= 7
 
 
+@pytest.mark.quick_cases("1-4", "6-9")
 @pytest.mark.parametrize(("given", "expected"), [(1, 4), (3, 5), (6, 9), (7, 10)])
 def test_points_are_those_of_the_cloud_and_pieces_cut_no_pulse(cloud, given, expected, tmp_path):
     las = laspy.convert(laspy.read(cloud), point_format_id=given)

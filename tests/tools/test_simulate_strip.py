@@ -325,6 +325,7 @@ def test_hazards_are_what_they_say():
     assert np.bincount(truth.count(5000), minlength=9)[[0, 1, 2, 8]] == pytest.approx([500, 2830, 1170, 500], rel=0.15)
 
 
+@pytest.mark.quick_cases("mixed")
 @pytest.mark.parametrize("name", ["mixed", "stiff", "shore"])
 def test_waveform_depends_on_seed_and_number_only(name):
     n = SEED_BLOCK + 900

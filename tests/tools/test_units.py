@@ -94,6 +94,7 @@ def test_times_in_nanoseconds_in_place_of_picoseconds_are_said(tmp_path, edit_po
     assert "samples 0.001 ns apart" in lines and "100% of " in lines and "the second lies off its ray" in lines
 
 
+@pytest.mark.quick_cases("0.0-*")
 @pytest.mark.parametrize(("degrees", "scale"), [(0.0, 0.001), (0.0, 0.1), (3.0, 0.01)])
 def test_points_that_were_turned_without_their_vectors_are_said(tmp_path, edit_points, degrees, scale):
     """From one zone to another: added echoes lay 30 cm aside, in silence. Coarse coordinates are no turn."""

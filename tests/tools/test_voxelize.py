@@ -367,6 +367,7 @@ def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target):
     assert len(made) == 1
 
 
+@pytest.mark.quick_cases(".las-4-0", ".laz-10-6")
 @pytest.mark.parametrize(("point_format", "output"), [(4, 0), (5, 0), (9, 6), (10, 6)])
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_a_point_cloud_holds_what_the_npz_holds(tmp_path, point_format, output, suffix):

@@ -60,6 +60,7 @@ def test_histograms_count_them(cloud, split):
     np.testing.assert_array_equal(found.counts, wanted.counts)
 
 
+@pytest.mark.quick_cases("100")
 @pytest.mark.parametrize("unit_points", [None, 100])
 def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path, edit_points, unit_points):
     """Both parts make the whole, also where the second return of a packet stands in a later unit."""
