@@ -564,7 +564,6 @@ class PairScale(NamedTuple):
 def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
     """Compare returns of one pulse, and heights of the ground, at up to SCALE_PLACES places of the strip."""
     ratios, bends, asides, heights = [np.empty(0)], [np.empty(0)], [np.empty(0)], [np.empty(0)]
-    rounded = 1.5 * max(map(abs, reader.facts.header.scales))  # of two positions, half a step each, in two axes
     units = _choose_units(scan)
     units, each = units[:: max(1, -(-len(units) // SCALE_PLACES))], max(SCALE_PLACES // max(len(units), 1), 1)
     places = [(first, stop) for begin, stop in units
@@ -587,6 +586,9 @@ def measure_scale(reader: StripReader, scan: StripScan) -> PairScale:
             bends.append((off / by_time)[good])
             along = (way * vectors[1:]).sum(axis=1) / np.sqrt((vectors[1:] ** 2).sum(axis=1))
             side = np.sqrt(np.maximum(apart**2 - along**2, 0.0))
+            # Two positions are rounded by half a step each, in two axes; programs write cm or dm in steps of mm.
+            steps = (np.gcd.reduce(np.diff(points[name].astype(np.int64))) for name in "XYZ")
+            rounded = 1.5 * max(step * abs(one) for step, one in zip(steps, reader.facts.header.scales, strict=True))
             asides.append(np.nan_to_num(np.maximum(side - rounded, 0.0) / apart, posinf=0.0)[good])
     ratio, height = np.concatenate(ratios), np.concatenate(heights)
     step = abs(reader.facts.header.scales[2])
