@@ -478,6 +478,18 @@ def test_ground_in_common_shows_light_that_is_uneven_across_the_swath(rng, size,
     assert judge_sides(calibration, found, other=False) == (0.0, [], [])
 
 
+def test_one_part_of_the_swath_that_is_off_is_no_uneven_light(rng):
+    """A roof: a sound strip over a town was said to change by 1 %, and its error fell from 8 to 5 %."""
+    ground, places = see_ground(rng)
+    _, later = see_ground(rng, ground)
+    later[2] += 0.4 * (later[4] > 0.18)
+    known = np.column_stack([np.ones(256), keep(places)]).ravel().tolist()
+    calibration = Calibration(1.0, 0.03, channels=(ChannelConstant(1, 0, 1.0, 0.03),), places=known, change_chance=0.3)
+    found = Setting(None, {}, {}, {(1, 0): later}, (1.0, 0.0), NO_CHANGE, None)
+    *_, across = compare_ground(later, keep(places))
+    assert across.chance > 0.5 and judge_sides(calibration, found, other=True) == (0.0, [], [])
+
+
 @pytest.mark.parametrize("energy", [1.8, 1.0, 0.7])
 @pytest.mark.parametrize("wrong", [True, False])
 def test_a_log_of_another_scale_is_no_other_laser(energy, wrong):

@@ -56,7 +56,7 @@ LIKE_FEET = 0.35
 """Logarithm by which light may differ from what feet taken for metres make of it: other surfaces, and more air."""
 
 HIDDEN = 0.05
-"""Error from which it is said that another gain or energy would not show."""
+"""Error from which it is said that another gain or energy would not show, or that light is uneven on common ground."""
 
 FROM_START = 2.0 / 3.0**0.5
 """Root mean square over a strip of light that changes evenly from its start, over the change from half to half."""
@@ -292,7 +292,8 @@ def judge_sides(
     sides = found.sides
     compared = [_compare_places(calibration, found, row) for row in calibration.channels if other]
     across = max((ground[2] for ground in compared if ground), key=lambda one: one.chance, default=settings.NO_CHANGE)
-    if across.chance > settings.LIKELY and not calibration.swath:
+    # One part of the swath that is off is a roof or a tree.
+    if across.chance > settings.LIKELY and across.shift > HIDDEN and not calibration.swath:
         growth = math.expm1(across.shift)
         return growth, [
             f"calibration: over ground in common light changes across the swath, by up to {100 * growth:.0f} % for two "
