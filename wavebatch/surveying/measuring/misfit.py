@@ -145,9 +145,10 @@ strip; and step by which they are raised."""
 MOST_FAINT = SystemPulse(1.0).faint_share
 """What a pulse of which no more is known may leave beside strong echoes."""
 
-FAINT_REACH, NEARER = 4.0, 2.0
-"""Widths of the pulse within which echoes may be faint, as in `stages.flags.unproven`; and how many more of them than
-as far beyond are no targets: of targets some half are so near, as they are found less often there."""
+FAINT_REACH, NEARER, MIRRORED = 4.0, 2.0, 32
+"""Widths of the pulse within which echoes may be faint, as in `stages.flags.unproven`; how many more of them than as
+far beyond are no targets: of targets some half are so near, as they are found less often there; and most of them for
+each that the mirror has beside strong ones: tails that change have 3 to 26, the bottom of shallow water hundreds."""
 
 
 def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> SystemPulse:
@@ -172,10 +173,11 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
     return replace(system, faint_share=min(max(MISFIT_PEAK * max(system.misfit, change), seen), system.faint_share))
 
 
-def cover_faint(system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+def cover_faint(system: SystemPulse, echoes: EchoTable, mirrored: int) -> SystemPulse:
     """The system with a `faint_share` above that of echoes that stand nearer to far stronger ones than targets do.
 
-    A tail that changes from shot to shot leaves such echoes, all within FAINT_REACH. Targets are as often further off.
+    A tail that changes from shot to shot leaves such echoes, all within FAINT_REACH, and dips as well, which the mirror
+    shows. Targets are as often further off, or, as grass or the bottom of shallow water, make no dips.
 
     Parameters
     ----------
@@ -183,6 +185,8 @@ def cover_faint(system: SystemPulse, echoes: EchoTable) -> SystemPulse:
         With the `faint_share` that misfit and noise leave.
     echoes : EchoTable
         Of a sample, decomposed with it.
+    mirrored : int
+        Echoes beside strong ones in the mirror.
 
     Returns
     -------
@@ -195,7 +199,7 @@ def cover_faint(system: SystemPulse, echoes: EchoTable) -> SystemPulse:
     np.minimum.at(nearest, row[faint], distance[faint])
     near = np.count_nonzero(nearest <= FAINT_REACH)
     far = np.count_nonzero(nearest <= 2 * FAINT_REACH) - near
-    if near < FEW or near - NEARER * far < SURE * np.sqrt(near + NEARER**2 * far):
+    if near < FEW or near > MIRRORED * mirrored or near - NEARER * far < SURE * np.sqrt(near + NEARER**2 * far):
         return system
     share = quantile(ratio[faint & (distance <= FAINT_REACH)], 0.95)
     return replace(system, faint_share=min(max(share, system.faint_share), MOST_FAINT))
