@@ -508,10 +508,12 @@ def test_a_spacing_in_another_unit_than_picoseconds_is_said(tmp_path, spacing, s
 
 @pytest.mark.parametrize(("divisor", "code"), [(1, []), (2, ["lost-samples"]), (4, [])])
 def test_sizes_in_samples_are_said(tmp_path, divisor, code):
-    """Half of each waveform was not read, and --quiet hid it."""
+    """Half of each waveform was not read, and --quiet hid it. Recordings of half of the longest length are sound."""
     raw = make_raw(bits=16)
     raw.points["wavepacket_size"] //= divisor
     assert list(scan_of(raw.write(tmp_path / "a.las")).doubts.values()) == code
+    raw.points["wavepacket_offset"] //= divisor
+    assert list(scan_of(raw.write(tmp_path / "b.las")).doubts.values()) == []
 
 
 @pytest.mark.parametrize("time", [0.0, np.nan, 7.0, None])

@@ -593,12 +593,17 @@ class Scanner:
         new = rows[first[first >= 0]]
         some = new[even_places(len(new), max(check.SAMPLED_PER_UNIT // self._thinning, 1))]
         self._found.sample.append((judged.keys[some], judged.n_samples[some], judged.packed[some]))
-        least = judged.n_samples[new] * np.take(self._widths, points["wavepacket_index"][new])
-        size = points["wavepacket_size"][new]
+        size, kind = points["wavepacket_size"][new], points["wavepacket_index"][new]
+        width, length = np.take(self._widths, kind), np.take(self._lengths, kind)
+        least = judged.n_samples[new] * width
         self._found.claimed += int(np.minimum(least, size).sum())
         self._found.tally.long += int(np.count_nonzero(size >= least + PADDING))
         self._found.tally.new += len(new)
-        in_samples = judged.short[new] & (size == np.take(self._lengths, points["wavepacket_index"][new]))
+        in_samples = judged.short[new] & (size == length)
+        if in_samples.any():  # and the rest is there: a short recording ends where the next one begins
+            at = points["wavepacket_offset"][new]
+            ahead = np.append(np.unique(at), np.uint64(2**64 - 1))
+            in_samples &= ahead[np.searchsorted(ahead, at, "right")] - at >= (length * width).astype(np.uint64)
         self._found.tally.in_samples += int(np.count_nonzero(in_samples))
         if len(rows):
             # Packets of one ray whose time is that of many others: a pulse with a packet for each return, it may be.
