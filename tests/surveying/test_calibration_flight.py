@@ -13,7 +13,7 @@ import wavebatch as wb
 from tests.facet_strips import FARMLAND, START, Sensor, compare_fields, write_field, write_strip
 from wavebatch.core.order import group_medians
 from wavebatch.surveying.calibrating.adjust_flight import TIE, VIEW, Anchors, Ties, adjust_constants, measure_ties
-from wavebatch.surveying.calibrating.calibrate_flight import fit_swath
+from wavebatch.surveying.calibrating.calibrate_flight import find_trend, fit_swath
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
 
 GAINS = {("a", 1): 1.0, ("b", 1): 1.08, ("c", 1): 0.95, ("c", 2): 0.4275}
@@ -159,6 +159,20 @@ def test_strips_of_three_headings_tell_light_that_falls_from_side_to_side(rng, s
     _, swath, edge, left_open = fit_swath(ties, anchors, at_targets, one, asked=False)
     assert swath == () and edge == 0.0
     assert left_open == (None if is_told else pytest.approx(0.05 * (strips == "ac"), abs=0.02))
+
+
+def test_one_block_of_ties_proves_no_trend(rng):
+    """All its resamples are the same: of overlaps of 40 cells, 49 of 60 sound pairs changed with the scan angle."""
+    zero, cell, source = np.zeros(80), np.repeat(np.arange(40), 2), np.tile([0, 1], 40)
+    anchors, named = Anchors(np.array([0.0, np.nan]), np.array([0.03, np.nan]), None), 0
+    for _ in range(20):
+        place = rng.uniform(0, 49, (40, 2))[cell]
+        view = np.zeros(80, VIEW)
+        view["angle"] = np.where(source, 40 - place[:, 1], place[:, 1]) / 700
+        value = rng.normal(0, 0.3, 40)[cell] + rng.normal(0, 0.05, 80)
+        ties = Ties(cell, source, value, zero + 0.01, zero, zero, place, 5.0, view)
+        named += find_trend(ties, anchors, np.zeros(2, VIEW), adjust_constants(ties, anchors)) is not None
+    assert named < 4
 
 
 def test_sources_without_ties_stay_unknown(rng):

@@ -182,8 +182,9 @@ def read_strip(
 LEAST_SPREAD = 0.01
 """Smaller changes of the brightness are not named."""
 
-EXPLAINED, SURE_TREND = 0.8, 6.0
-"""A trend leaves at most this share of the scatter, or it is so many times its error."""
+EXPLAINED, SURE_TREND, LEAST_BLOCKS = 0.8, 6.0, 4
+"""A trend leaves at most this share of the scatter, or it is so many times its error by resamples of so many blocks:
+those of one block are all the same, and show no error."""
 
 MOST_EDGE_ERROR = 0.05
 """The term over the scan angle is refused where it is less certain than this at the edge of the swath, relative."""
@@ -302,6 +303,7 @@ def find_trend(
         Whether a term over the scan angle was fitted, whose error holds what overlaps leave open.
     """
     best: list[tuple[float, float, Trend]] = []
+    few = len(np.unique(np.floor(ties.centre / adjust.BLOCK), axis=0)) < LEAST_BLOCKS
     for name, columns, at_targets in _list_columns(ties, seen) if len(ties.cell) else ():
         known = np.isfinite(at_targets).all(axis=1)
         shown = replace(anchors, columns=np.where(known[:, None], at_targets, 0.0))
@@ -313,7 +315,7 @@ def find_trend(
         explains = adjusted.scatter >= LEAST_SPREAD and fit.scatter < EXPLAINED * adjusted.scatter
         if not explains:
             # Uneven cells hide what all of them show together; range and incidence follow the angle then.
-            if fitted or spread < LEAST_SPREAD or name not in ("scan angle", "time"):
+            if fitted or few or spread < LEAST_SPREAD or name not in ("scan angle", "time"):
                 continue
             again = adjust.adjust_constants(ties, shown, columns).term_trials
             if spread < SURE_TREND * float(np.sqrt(np.mean(np.var(against @ again.T, axis=1)))):
