@@ -198,6 +198,10 @@ def test_units_of_long_waveforms_are_small_and_give_the_same_segments(strip, tmp
     monkeypatch.setattr("wavebatch.cli.geometry.MOST_SAMPLES", 80 * 1000)
     succeed("slice", strip, "-o", tmp_path / "b.csv")
     assert len(read) > 3 and max(read) < 1100
+    monkeypatch.setattr("wavebatch.cli.geometry.UNIT_POINTS", 500)  # of short ones they are no larger than usual
+    read.clear()
+    succeed("slice", strip, "-o", tmp_path / "c.csv")
+    assert max(read) < 600
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 

@@ -24,7 +24,7 @@ from wavebatch.files.disk.publish import refuse_existing, refuse_input
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.geojson import GEOJSON_CRS, plan_crs
 from wavebatch.files.las.crs import describe_crs, read_crs_definition
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import UNIT_POINTS, StripReader
 from wavebatch.surveying import survey_blocks
 from wavebatch.tools import slice_output
 from wavebatch.tools.scan_slices import MOST_SAMPLES, SliceOptions, cut_slice, find_segments, read_scan_lines
@@ -108,7 +108,7 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
     png, overview = options["png"], options["overview"]
     with StripReader(strip, direction=options["direction"]) as reader:
         longest = max((one.n_samples for one in reader.facts.digitizers.values()), default=0)
-    units = MOST_SAMPLES // max(longest, 1)  # of 50,000 waveforms of 1,000 samples took 2.3 GB
+    units = min(UNIT_POINTS, MOST_SAMPLES // max(longest, 1))  # 50,000 waveforms of 1,000 samples took 2.3 GB
     with StripReader(reader.facts, unit_points=units) as reader, reader.scan() as scan, ExitStack() as stack:
         crs = None
         if output is not None and output.suffix.lower() == ".geojson":
