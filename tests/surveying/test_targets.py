@@ -21,6 +21,7 @@ from wavebatch.surveying.calibrating.calibration_files import (
     load_targets,
     parse_calibration,
 )
+from wavebatch.surveying.calibrating.strip_echoes import CLEAN_ECHO
 from wavebatch.tools.simulate import find_scene, simulate_strip, strip
 from wavebatch.tools.simulate.render import EAST, GROUND, NORTH, START_TIME
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
@@ -241,3 +242,16 @@ def test_a_small_target_in_a_large_outline_shows_on_uneven_ground(few, apart, rn
     edge, error = targets_module._compare_edge(constant, depth)
     true = abs(apart - np.median(constant))
     assert edge is None if apart == 1.0 else error == pytest.approx(true / np.median(constant), rel=0.25)
+
+
+@pytest.mark.parametrize("hole", [0.0, 0.5, 1.5])
+def test_a_middle_without_an_echo_is_said_with_its_size(hole, rng):
+    """A target of 1.2 m in an outline of 6 m whose middle no pulse met: 71 % off, with 3 % stated, in silence."""
+    rows = np.zeros(400, CLEAN_ECHO)
+    rows["xyz"][:, :2] = rng.uniform(-3, 3, (400, 2))
+    rows = rows[np.abs(rows["xyz"]).max(axis=1) > hole]
+    rows["ray"], rows["distance"] = (0.0, 0.0, -1.0), 700.0
+    rows["light"], rows["light_err"] = 1e4 * (1 + 0.02 * rng.standard_normal(len(rows))), 1.0
+    target = Target("t", 0.3, np.array([(-3.0, -3.0), (3.0, -3.0), (3.0, 3.0), (-3.0, 3.0)]))
+    result, *_ = targets_module.measure_target(target, rows, 0.1, 0.03)
+    assert result.hidden_m == (pytest.approx(2 * hole, abs=0.3) if hole > 1.0 else None)
