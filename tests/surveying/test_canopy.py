@@ -289,39 +289,38 @@ def test_fits_that_miss_their_samples_are_neighbours_only_where_there_are_some(c
     assert (cover_fits(system, table, 1.0)[0] > 0) == raised
 
 
-@pytest.mark.quick_cases("4385")
-@pytest.mark.parametrize("number", [3230, 4385])
-def test_a_pulse_that_changes_is_seen_where_neighbours_are_rare(number, tmp_path):
-    """3 to 5 % of the fits of lone echoes missed their samples, as in canopies: 4 % of the echoes were false."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and result["extra"] < 0.03
+# 3 to 5 % of the fits of lone echoes missed their samples, as in canopies: 4 % of the echoes were false.
+RARE_NEIGHBOURS = {3230: (1.0, 0.03), 4385: (1.0, 0.03)}
+# Of 3,000 noises 2 % are clear: 4 % of such echoes were missed behind others, as tails of stronger ones.
+BEHIND_STRONGER = {4376: (0.02, 1.0), 3799: (0.02, 1.0)}
+# Echoes that repeat beside stronger ones. Six Gaussians hardly follow the onset: 34 and 44 % of the echoes were false.
+REPEATED = {4204: (1.0, 0.02), 2052: (1.0, 0.02)}
+# Neighbours too close to be found, in the mirror, in the stack raise neither misfit nor significance: 3 to 6 % of the
+# clear echoes were lost.
+NEIGHBOURS = {1398: (0.03, 1.0), 1836: (0.03, 1.0), 1661: (0.03, 1.0)}
+# Two rounds of all echoes end far from the pulse that describes no shorter: 10 % were missed, 4 % were false.
+LONG_LEARNED = {1737: (0.03, 0.03), 1879: (0.03, 0.03), 3208: (0.03, 0.03)}
+# Skewed pulses hardly wider than the samples, and one that rings: waveforms with one echo teach what their stack does
+# not; 42 and 5 % were false, 4 % missed. And one that changes, where the stack shows as much: 7 % were false.
+ONE_ECHO = {2465: (0.03, 0.02), 2743: (0.03, 0.02), 3001: (0.03, 0.02), 1221: (0.03, 0.02)}
+# An undershoot that was cut off at 0: 14 and 3 % of the echoes were what is left there of a receiver that rings.
+CUT_UNDERSHOOT = {2022: (1.0, 0.03), 1920: (1.0, 0.03)}
+# A part before the pulse: a tail was measured with the model's broad part taken off there, which no fit takes off. 74
+# packets of a canopy show none in what is left, nor a mixed scene (5 and 22 % were false): its echoes are all alike.
+PART_BEFORE = {1193: (1.0, 0.02), 1892: (1.0, 0.02), 2187: (1.0, 0.02), 2166: (1.0, 0.02)}
+STRANGERS = {**RARE_NEIGHBOURS, **BEHIND_STRONGER, **REPEATED, **NEIGHBOURS, **LONG_LEARNED, **ONE_ECHO,
+             **CUT_UNDERSHOOT, **PART_BEFORE}  # fmt: skip
+"""Shares of echoes that may be missed and false."""
 
 
-@pytest.mark.quick_cases("3799")
-@pytest.mark.parametrize("number", [4376, 3799])
-def test_clear_echoes_do_not_become_the_tail_of_stronger_ones(number, tmp_path):
-    """Of 3,000 noises 2 % are clear: 4 % of such echoes were missed behind others."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and result["missed"] < 0.02
+@pytest.mark.quick_cases("4385", "3799", "4204", "1398", "3208", "2465", "2022", "1193", "2187")
+@pytest.mark.parametrize("number", STRANGERS)
+def test_canopies_of_strangers_are_right(number, tmp_path):
+    result, (missed, extra) = judge_strip(number, tmp_path), STRANGERS[number]
+    assert result["right"] and result["missed"] < missed and result["extra"] < extra
 
 
-@pytest.mark.quick_cases("4204")
-@pytest.mark.parametrize("number", [4204, 2052])
-def test_echoes_that_repeat_beside_stronger_ones_are_misfit(number, tmp_path):
-    """Six Gaussians hardly follow the onset of such a pulse: 34 and 44 % of the echoes were false."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and result["extra"] < 0.02
-
-
-@pytest.mark.quick_cases("1398")
-@pytest.mark.parametrize("number", [1398, 1836, 1661])
-def test_neighbours_raise_neither_misfit_nor_significance(number, tmp_path):
-    """Those too close to be found, those in the mirror, those in the stack: 3 to 6 % of the clear echoes were lost."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and result["missed"] < 0.03
-
-
-@pytest.mark.quick_cases("2395")
+@pytest.mark.quick_cases("3682-*")
 @pytest.mark.parametrize(("number", "missed"), [(2395, 0.02), (1355, 0.01), (3682, 0.035), (1274, 0.035)])
 def test_echoes_hidden_in_the_noise_are_not_taken_for_it(number, missed, tmp_path):
     """Short packets full of leaves: noise was up to 1.7 times as large, 4 to 5 % of the clear echoes were lost."""
@@ -333,20 +332,12 @@ def test_echoes_hidden_in_the_noise_are_not_taken_for_it(number, missed, tmp_pat
     assert less < 0.9 * more
 
 
-@pytest.mark.quick_cases("3208")
-@pytest.mark.parametrize("number", [1737, 1879, 3208])
-def test_a_pulse_is_learned_until_it_describes_no_shorter(number, tmp_path):
-    """Two rounds of all echoes end far from it: 10 % of the clear echoes were missed, 4 % were false."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and max(result["missed"], result["extra"]) < 0.03
-
-
-@pytest.mark.quick_cases("2603")
-@pytest.mark.parametrize(("number", "missed"), [(2603, 0.01), (1417, 0.01), (5204, 0.01)])
-def test_a_width_that_its_own_echoes_contradict_is_no_pulse(number, missed, tmp_path):
+@pytest.mark.quick_cases("5204")
+@pytest.mark.parametrize("number", [2603, 1417, 5204])
+def test_a_width_that_its_own_echoes_contradict_is_no_pulse(number, tmp_path):
     """Pulses half as wide describe canopies as short: 17 and 7 % of the clear echoes were missed. All were a guess."""
     result = judge_strip(number, tmp_path)
-    assert result["right"] and result["missed"] < missed and not result["doubts"]
+    assert result["right"] and result["missed"] < 0.01 and not result["doubts"]
     assert result["width_ratio"] == pytest.approx(1, abs=0.08)
 
 
@@ -355,29 +346,3 @@ def test_noise_that_is_smooth_widens_no_pulse_of_a_canopy(tmp_path):
     result = judge_strip(3138, tmp_path)
     assert result["right"] and not result["extra"] and (result["doubts"] or result["missed"] < 0.01)
     assert result["width_ratio"] == pytest.approx(1, abs=0.02)
-
-
-@pytest.mark.quick_cases("2465")
-@pytest.mark.parametrize("number", [2465, 2743, 3001, 1221])
-def test_waveforms_with_one_echo_teach_what_their_stack_does_not(number, tmp_path):
-    """Skewed pulses hardly wider than the samples, and one that rings: 42 and 5 % were false, 4 % missed. And one that
-    changes from shot to shot, where the stack shows as much: 7 % were false."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and result["missed"] < 0.03 and result["extra"] < 0.02
-
-
-@pytest.mark.quick_cases("2022")
-@pytest.mark.parametrize("number", [2022, 1920])
-def test_an_undershoot_that_was_cut_off_hides_no_echo(number, tmp_path):
-    """Counts end at 0: 14 and 3 % of the echoes were what is left there of a receiver that rings."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and result["extra"] < 0.03
-
-
-@pytest.mark.quick_cases("1193", "2187")
-@pytest.mark.parametrize("number", [1193, 1892, 2187, 2166])
-def test_a_part_before_the_pulse_is_no_echo(number, tmp_path):
-    """A tail was measured with the model's broad part taken off there, which no fit takes off. 74 packets of a canopy
-    show none in what is left of their samples, nor a mixed scene (5 and 22 % were false): its echoes are all alike."""
-    result = judge_strip(number, tmp_path)
-    assert result["right"] and result["extra"] < 0.02
