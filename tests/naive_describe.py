@@ -81,8 +81,8 @@ def measure_change(evaluate, left, model, used, echoes, std, gain, correlation):
     return [row @ rest / (row @ row) for row in rows], [row @ row for row in rows]
 
 
-def gather(left, model, used, echoes, std, gain, change, delay, sigma, reference):
-    """Normal equations of one waveform."""
+def gather(evaluate, left, model, used, echoes, std, gain, change, delay, sigma, reference, counted):
+    """Normal equations of one waveform, in which what its echoes may absorb counts less."""
     x = np.arange(float(len(left)))
     spread = std**2 + gain * np.maximum(model, 0) + change**2 * model**2
     weight = used * (FREEDOM + 1) / (FREEDOM + left**2 / spread) / spread
@@ -93,8 +93,11 @@ def gather(left, model, used, echoes, std, gain, change, delay, sigma, reference
             wide = np.sqrt(max(width**2 + own**2 - reference**2, 0.1 * width**2))
             column += amplitude * own / wide * np.exp(-0.5 * ((x - time - place) / wide) ** 2)
         columns.append(column)
-    rows = np.array([*columns, np.ones(len(x))])
-    return rows * weight @ rows.T, rows * weight @ (left + model)
+    rows = np.array([*columns, np.ones(len(x)), left + model]) * np.sqrt(weight)
+    moves = np.array([row for echo in echoes for row in rows_of(evaluate, x, echo)[:2]]) * np.sqrt(weight)
+    moves = np.linalg.qr(moves.T)[0]
+    rows = rows - (1 - counted) * rows @ moves @ moves.T
+    return rows[:-1] @ rows[:-1].T, rows[:-1] @ rows[-1]
 
 
 def describe_widths(ratio, error, known, scatters, wider, anywhere):

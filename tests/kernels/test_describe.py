@@ -73,13 +73,14 @@ def test_changes_are_those_of_a_loop(noise, rng):
         np.testing.assert_allclose(precision[i], expected[1], rtol=5e-3)
 
 
-def test_normal_equations_are_those_of_a_loop(rng):
+@pytest.mark.parametrize("counted", [1.0, 0.3])
+def test_normal_equations_are_those_of_a_loop(counted, rng):
     sums = _problem(SHAPES[2], rng)
     delay, sigma, noise = np.arange(-4.0, 9.0), np.full(13, 1.4), describe.SampleNoise(1.1, 0.03)
-    matrix, right = describe.gather_pulse(sums, noise, 0.01, delay, sigma, 2.0, 3)
+    matrix, right = describe.gather_pulse(sums, noise, 0.01, delay, sigma, 2.0, 3, counted)
     expected = [
-        naive.gather(sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i], _echoes(sums, i), 1.1, 0.03,
-                     0.01, delay, sigma, 2.0)
+        naive.gather(_evaluate(SHAPES[2]), sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i],
+                     _echoes(sums, i), 1.1, 0.03, 0.01, delay, sigma, 2.0, counted)
         for i in range(len(sums.left)) if 0 < len(_echoes(sums, i)) <= 3
     ]  # fmt: skip
     np.testing.assert_allclose(matrix, sum(one for one, _ in expected), rtol=1e-3, atol=1e-2)

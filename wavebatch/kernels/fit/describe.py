@@ -160,8 +160,9 @@ def describe_widths(
 
 
 def gather_pulse(
-    sums: Sums, noise: SampleNoise, change: float, delay: np.ndarray, sigma: np.ndarray, reference: float, most: int
-) -> tuple[np.ndarray, np.ndarray]:
+    sums: Sums, noise: SampleNoise, change: float, delay: np.ndarray, sigma: np.ndarray, reference: float, most: int,
+    counted: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return normal equations of a pulse that is a sum of Gaussians, from all echoes of all waveforms.
 
     Parameters
@@ -176,6 +177,8 @@ def gather_pulse(
         Width of the present pulse's main component [samples]: an echo that is wider is widened by its target.
     most : int
         Echoes of a waveform from which it says nothing of the pulse.
+    counted : float
+        Weight of errors of the pulse that amplitudes and times of the echoes may absorb.
 
     Returns
     -------
@@ -189,7 +192,7 @@ def gather_pulse(
     structure = _as_structure(sums, noise, change)
     call(
         "learn_pulse", structure, ctypes.c_int64(k), delay, variance, ctypes.c_double(reference), ctypes.c_int64(most),
-        matrix, right,
+        ctypes.c_double(counted), matrix, right,
     )  # fmt: skip
     return matrix, right
 

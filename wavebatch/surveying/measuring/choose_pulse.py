@@ -121,6 +121,9 @@ ALONE = 256
 MORE_ROUNDS = 8
 """Further rounds of all echoes, at most: each goes a part of the way, and five reached a pulse that was a sixth off."""
 
+COUNTED = 0.3
+"""Weight of errors of the pulse that echoes may absorb in these."""
+
 FIRST_CHANGE = 0.01
 """Change of the pulse from shot to shot, at least, in the first round of each: what a pulse of few Gaussians misses
 must not become echoes, which would keep the shoulders of the next one as wrong."""
@@ -327,7 +330,7 @@ def _learn(taught: WaveformBlock, judged: WaveformBlock, begin: Candidate) -> li
         if _save(last, before) <= LEAST_SAVED or before.exceeds(last) <= HINT:
             break
         explained = explain(taught, bear(last.system, begin.change))
-        system = learn_jointly(taught, last.system, explained, begin.change, last=True)
+        system = learn_jointly(taught, last.system, explained, begin.change, last=True, counted=COUNTED)
         rounds.append(_judge(judged, OF_ANY, system, CHANGES[1], known=False))
     return [*found[:-1], min(rounds[1:], key=lambda one: one.typical)]
 

@@ -52,7 +52,7 @@ ALIKE = 1.1
 
 
 def learn_jointly(
-    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float, *, last: bool
+    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float, *, last: bool, counted: float = 1.0
 ) -> SystemPulse:
     """Learn the pulse that describes all waveforms best, given where their echoes are.
 
@@ -67,6 +67,8 @@ def learn_jointly(
         Of the pulse from shot to shot, as a share of its amplitude.
     last : bool
         Whether the pulse is final; else it only has to separate echoes, and few Gaussians serve.
+    counted : float
+        Weight of errors of the pulse that amplitudes and times of the echoes may absorb.
 
     Returns
     -------
@@ -81,7 +83,7 @@ def learn_jointly(
     known they are 0. The kernels then get the sum of the fewest free Gaussians that serves as well.
     """
     spacing = block.spacing
-    stack = stack_jointly(system, explained, change, spacing)
+    stack = stack_jointly(system, explained, change, spacing, counted)
     half = stack.lag[stack.value > 0.5]
     if not len(half):  # of steps and other signal that is no echo nothing is learned
         return system
@@ -99,7 +101,9 @@ def learn_jointly(
     return with_fit(system, best, stack, width, spacing, misfit)
 
 
-def stack_jointly(system: SystemPulse, explained: Explained, change: float, spacing: float) -> Stack:
+def stack_jointly(
+    system: SystemPulse, explained: Explained, change: float, spacing: float, counted: float = 1.0
+) -> Stack:
     """Return the pulse with its errors by lag [samples]."""
     s = explained.sums.left.shape[1]
     width = system.sigma_ref / spacing
@@ -117,7 +121,7 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     # Samples that were cut off leave nothing, whatever the pulse is there: they teach nothing.
     sums = explained.sums._replace(used=explained.sums.used & (explained.sums.left != 0))
     matrix, right = gather_pulse(
-        sums, noise, max(change, LEAST_CHANGE), delay, sigma, reference, MOST_ECHOES
+        sums, noise, max(change, LEAST_CHANGE), delay, sigma, reference, MOST_ECHOES, counted
     )
     # Coloured noise: so many samples say as much as one of white noise.
     share = (system.noise.std / max(system.noise.quiet, 1e-6)) ** 2
