@@ -328,7 +328,7 @@ def _survey(
         beside = mirror.beside - float(np.sqrt(mirror.beside)) if mirror.beside >= LEAST_HELD else 0.0
         missed = beside / max(mirror.mains, 1)
         shares = choice.doubt, doubt, left, repeated_share, fixed_share, missed if missed > MOST_DOUBTED else 0.0
-        figures.echoes_in_doubt = max(shares)
+        figures.echoes_in_doubt = min(max(shares), 1.0)
     else:
         part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
