@@ -1,7 +1,8 @@
-"""Runs a part of the judges in another checkout, and compares two results side by side."""
+"""Runs a part of the judges in another checkout, and compares two results side by side; the command of two judges."""
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import os
@@ -15,6 +16,8 @@ from typing import Any
 import numpy as np
 
 FWHM_PER_SIGMA = 2.3548200450309493
+GROUP = 25
+"""Strips of one process."""
 
 
 def run_in(root: Path, script: Path, arguments: Iterable[str]) -> Iterator[dict[str, Any]]:
@@ -95,3 +98,52 @@ def _format(value: Any) -> str:
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return "-"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def verdict(result: dict[str, Any]) -> str:
+    """One word for right or wrong, said or not."""
+    said = bool(result["doubts"])
+    return ("doubted" if said else "right") if result["right"] else ("said" if said else "silent")
+
+
+def read_numbers(text: str) -> list[int]:
+    """Numbers of "0-299", "3,7" and mixtures of these."""
+    parts = [part.split("-") for part in text.split(",")]
+    return [number for part in parts for number in range(int(part[0]), int(part[-1]) + 1)]
+
+
+def judge_seeds(
+    script: Path, text: str | None, judge: Callable[[int, Path], dict[str, Any]], tabulate: Callable, home: str,
+    seeds: str,
+) -> int:  # fmt: skip
+    """The command of a judge of numbered strips, which are kept in the folder `home` beside the checkout."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, default=Path(__file__).parents[2], help="checkout to judge")
+    parser.add_argument("--seeds", default=seeds, help="strips, as 0-299 or 3,7,11")
+    parser.add_argument("--strips", type=Path, default=Path(__file__).parents[3] / home,
+                        help="folder that keeps the strips; default: beside the checkout")
+    parser.add_argument("-o", "--output", type=Path, help="JSON lines; strips that are there already are kept")
+    parser.add_argument("--compare", type=Path, help="JSON lines of another checkout")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    numbers = read_numbers(given.seeds)
+    if given.child:
+        given.strips.mkdir(parents=True, exist_ok=True)
+        for number in numbers:
+            print(json.dumps(judge(number, given.strips)), flush=True)
+        return 0
+    kept = read_lines(given.output) if given.output and given.output.exists() else []
+    results = {one["strip"]: one for one in kept}
+    todo = [number for number in numbers if number not in results]
+    for start in range(0, len(todo), GROUP):
+        group = ",".join(map(str, todo[start : start + GROUP]))
+        for one in run_in(given.root.resolve(), script, ["--seeds", group, "--strips", str(given.strips)]):
+            results[one["strip"]] = one
+            seconds = one.get("survey_s", one.get("run_s", np.nan))
+            print(f"{one['strip']}: {verdict(one)} in {seconds:.2f} s", file=sys.stderr)
+            if given.output:
+                with given.output.open("a") as file:
+                    file.write(json.dumps(one) + "\n")
+    older = read_lines(given.compare) if given.compare else []
+    print(tabulate([results[number] for number in numbers if number in results], older))
+    return 0

@@ -7,16 +7,13 @@ A strip is right where 97 % of its clear echoes are found and at most 3 % of the
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from checkouts import FWHM_PER_SIGMA, find_doubts, find_echoes, format_table, read_lines, run_in, timed
+from checkouts import FWHM_PER_SIGMA, find_doubts, find_echoes, format_table, judge_seeds, timed, verdict
 from stranger_strips import draw_sensor, make_shape, make_strip
 
 CLEAR = 8.0
@@ -32,8 +29,6 @@ FOUND = 0.5
 ONE = 0.7
 """True echoes closer than this [widths] may be found as one, so that far from them."""
 MOST_MISSED, MOST_EXTRA = 0.03, 0.03
-GROUP = 25
-"""Strips of one process."""
 
 
 def find_clear(sensor: Any, truth: dict[str, np.ndarray]) -> np.ndarray:
@@ -152,12 +147,6 @@ def judge_strip(number: int, folder: Path) -> dict[str, Any]:
     return result
 
 
-def verdict(result: dict[str, Any]) -> str:
-    """One word for right or wrong, said or not."""
-    said = bool(result["doubts"])
-    return ("doubted" if said else "right") if result["right"] else ("said" if said else "silent")
-
-
 def tabulate(results: list[dict[str, Any]], older: list[dict[str, Any]]) -> str:
     """The table by cause, and a line for each strip that is not right, or differs from an older result."""
     before = {one["strip"]: one for one in older}
@@ -195,42 +184,5 @@ def _mean(group: list[dict[str, Any]], name: str, average: Any = np.mean) -> flo
     return float(average(values)) if values else float("nan")
 
 
-def read_numbers(text: str) -> list[int]:
-    """Numbers of "0-299", "3,7" and mixtures of these."""
-    parts = [part.split("-") for part in text.split(",")]
-    return [number for part in parts for number in range(int(part[0]), int(part[-1]) + 1)]
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", type=Path, default=Path(__file__).parents[2], help="checkout to judge")
-    parser.add_argument("--seeds", default="0-299", help="strips, as 0-299 or 3,7,11")
-    parser.add_argument("--strips", type=Path, default=Path(__file__).parents[3] / "strangers",
-                        help="folder that keeps the strips; default: beside the checkout")
-    parser.add_argument("-o", "--output", type=Path, help="JSON lines; strips that are there already are kept")
-    parser.add_argument("--compare", type=Path, help="JSON lines of another checkout")
-    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args(arguments)
-    numbers = read_numbers(given.seeds)
-    if given.child:
-        for number in numbers:
-            print(json.dumps(judge_strip(number, given.strips)), flush=True)
-        return 0
-    kept = read_lines(given.output) if given.output and given.output.exists() else []
-    results = {one["strip"]: one for one in kept}
-    todo = [number for number in numbers if number not in results]
-    for start in range(0, len(todo), GROUP):
-        group = ",".join(map(str, todo[start : start + GROUP]))
-        for one in run_in(given.root.resolve(), Path(__file__), ["--seeds", group, "--strips", str(given.strips)]):
-            results[one["strip"]] = one
-            print(f"{one['strip']}: {verdict(one)} in {one.get('survey_s', np.nan):.2f} s", file=sys.stderr)
-            if given.output:
-                with given.output.open("a") as file:
-                    file.write(json.dumps(one) + "\n")
-    older = read_lines(given.compare) if given.compare else []
-    print(tabulate([results[number] for number in numbers if number in results], older))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(judge_seeds(Path(__file__), __doc__, judge_strip, tabulate, "strangers", "0-299"))
