@@ -320,7 +320,8 @@ def _survey(
         repeated_share = share_repeated(echoes, system.sigma_ref)
         if repeated_share > MOST_DOUBTED:
             system, echoes = cover_repeated(part, system, echoes)
-        if (covered := cover_faint(system, echoes, mirror.beside)) is not system:
+        covered = cover_faint(system, echoes, mirror.beside / max(mirror.echoes, 1))  # of another sample
+        if covered is not system:
             system, echoes = covered, decompose_sample(part, covered)
         fixed_share = share_fixed(echoes, len(part), block.spacing)
         figures.width_in_doubt = choice.spread

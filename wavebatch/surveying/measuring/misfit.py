@@ -173,7 +173,7 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
     return replace(system, faint_share=min(max(MISFIT_PEAK * max(system.misfit, change), seen), system.faint_share))
 
 
-def cover_faint(system: SystemPulse, echoes: EchoTable, mirrored: int) -> SystemPulse:
+def cover_faint(system: SystemPulse, echoes: EchoTable, mirrored: float) -> SystemPulse:
     """The system with a `faint_share` above that of echoes that stand nearer to far stronger ones than targets do.
 
     A tail that changes from shot to shot leaves such echoes, all within FAINT_REACH, and dips as well, which the mirror
@@ -185,8 +185,8 @@ def cover_faint(system: SystemPulse, echoes: EchoTable, mirrored: int) -> System
         With the `faint_share` that misfit and noise leave.
     echoes : EchoTable
         Of a sample, decomposed with it.
-    mirrored : int
-        Echoes beside strong ones in the mirror.
+    mirrored : float
+        Echoes beside strong ones in the mirror, over those of its waveforms.
 
     Returns
     -------
@@ -199,7 +199,8 @@ def cover_faint(system: SystemPulse, echoes: EchoTable, mirrored: int) -> System
     np.minimum.at(nearest, row[faint], distance[faint])
     near = np.count_nonzero(nearest <= FAINT_REACH)
     far = np.count_nonzero(nearest <= 2 * FAINT_REACH) - near
-    if near < FEW or near > MIRRORED * mirrored or near - NEARER * far < SURE * np.sqrt(near + NEARER**2 * far):
+    sure = near - NEARER * far >= SURE * np.sqrt(near + NEARER**2 * far)
+    if near < FEW or not sure or near > MIRRORED * mirrored * len(echoes):
         return system
     share = quantile(ratio[faint & (distance <= FAINT_REACH)], 0.95)
     return replace(system, faint_share=min(max(share, system.faint_share), MOST_FAINT))
