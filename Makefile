@@ -69,7 +69,7 @@ readers: $(VENV)/.test
 PYTEST := LC_ALL=C.UTF-8 PYTHONUTF8=1 $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.test
-	@echo "The fast tests: about 4 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
+	@echo "The fast tests: about 3 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
 	$(PYTEST) -m 'not slow'
 
 # Tests that fail run once more, because a busy machine may fail one by chance: red twice decides. Only where all tests
@@ -77,7 +77,7 @@ test: $(VENV)/.test
 SLOW := $(PYTEST) -m slow -o cache_dir=.pytest_cache/slow -o faulthandler_timeout=600
 
 slow: $(VENV)/.test
-	@echo "The slow tests: about 25 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
+	@echo "The slow tests: about 11 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
 	$(SLOW) --cache-clear || { [ $$? = 1 ] && \
 	  echo "The tests named above were red once. Again; PASSED below is red by chance, FAILED decides:" && \
 	  $(SLOW) --last-failed --last-failed-no-failures none -rpfE; }

@@ -41,10 +41,13 @@ LONG = (
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_collection_modifyitems(config, items):
     """All cases but those that `quick_cases` names are slow; processes of xdist get the long files first."""
+    config.quick_cases = named = Counter()
     for item in items:
-        quick = item.get_closest_marker("quick_cases")
-        if quick and not any(fnmatch.fnmatchcase(item.callspec.id, name) for name in quick.args):
-            item.add_marker("slow")
+        if quick := item.get_closest_marker("quick_cases"):
+            fits = {name: fnmatch.fnmatchcase(item.callspec.id, name) for name in quick.args}
+            named.update({(item.nodeid.split("[")[0], name): fit for name, fit in fits.items()})
+            if not any(fits.values()):
+                item.add_marker("slow")
     yield
     if hasattr(config, "workerinput"):
         number = Counter(item.path for item in items)

@@ -195,3 +195,8 @@ def test_no_two_classes_or_functions_have_one_name():
                 places.setdefault(node.name, set()).add(path)  # once for all its overloads; F811 finds the others
     assert len(places) > 1000
     assert {name: paths for name, paths in places.items() if len(paths) > 1} == {}
+
+
+def test_quick_cases_are_cases(request):
+    """A test whose quick cases are misspelt would never run among the fast ones."""
+    assert [one for one, cases in request.config.quick_cases.items() if not cases] == []
