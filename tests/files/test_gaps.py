@@ -378,6 +378,33 @@ def test_packed_strips_are_read_in_the_order_that_is_smoother(tmp_path, rng, bit
         assert f"samples of {bits} bits are packed" in run_command(command, path).stdout
 
 
+@pytest.mark.parametrize(
+    ("bits", "kind", "scale", "said"),
+    [(16, ">u2", 1, "bytes in the other order"), (32, ">u4", 1000, "bytes in the other order"),
+     (32, "<f4", 1e-3, "floating-point"), (32, "<u4", 1 << 20, ""), (16, "<u2", 16, "")],
+)  # fmt: skip
+def test_samples_that_are_no_unsigned_integers_are_said(tmp_path, rng, bits, kind, scale, said):
+    raw = make_raw(60, n_samples=40, bits=bits)
+    raw.packets = (smooth_counts(rng, 60, 40, 11) * scale).astype(kind).tobytes()
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert [code for line, code in scan.doubts.items() if "seem to" in line] == ["packets"] * bool(said)
+        assert said in " ".join(scan.warnings)
+
+
+@pytest.mark.parametrize("count", [0, 2, 40, 255])
+@pytest.mark.parametrize("place", [slice(10), slice(-10, None)])
+def test_fill_with_other_counts_is_said(tmp_path, rng, count, place):
+    """Of a forest that was filled up with 20 over a level of 12 half of the echoes were false, in silence."""
+    raw, samples = make_raw(60, n_samples=60), smooth_counts(rng, 60, 60, 8)
+    raw.packets = samples.astype("u1").tobytes()
+    samples[::2, place] = count
+    raw.packets = samples.astype("u1").tobytes()
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        doubts = scan.doubts
+    assert list(doubts.values()) == ["packets"] * (count not in (0, 255))
+    assert all(f"30 of 60 packets that were looked at begin or end with equal counts of {count}," in k for k in doubts)
+
+
 def mirror(source, target):
     content = np.frombuffer(source.read_bytes(), np.uint8).copy()
     start = read_header(source).waveform_start + 60

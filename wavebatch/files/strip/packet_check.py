@@ -41,7 +41,7 @@ from wavebatch.files.strip.packets import (
     refuse_compressed,
 )
 from wavebatch.kernels.packets import FIELDS, Geometry, PacketRules, judge_packets
-from wavebatch.kernels.signal.signal import find_fill, recorded_lengths
+from wavebatch.kernels.signal.signal import LEAST_PADDING, find_fill, recorded_lengths
 
 DIRECTIONS = ("auto", "toward", "away")
 VECTORS = ("x_t", "y_t", "z_t")
@@ -499,6 +499,13 @@ LEAST_VOTES, MAJORITY = 20, 9
 """Votes that decide, and how many times as many they must be as the others."""
 LEAST_SKEWNESS = 1.0
 """Skewness of the deviations from the median that decides; one side of a Gaussian noise has 0, echoes have 3 to 10."""
+SMOOTHER = 8
+"""Neighbouring samples that differ so many times less with their bytes in the other order have that order: a byte that
+changes at random is 256 times as large in the wrong place, and noise that hides the signal makes both alike."""
+FILL_STEP = 3
+"""Counts from fill to the first recorded sample, in the middle of all packets; echoes and noise fade into a level."""
+FLOATS = 107 << 23, 157 << 23
+"""Bits of 2^-20 and 2^30 as 32-bit floating-point numbers: samples that are such lie there, over a factor of 2."""
 
 
 @frozen
@@ -511,6 +518,8 @@ class SampleForm:
     """Counts go down where light comes in."""
     notes: tuple[str, ...] = ()
     """What was decided and why, for users."""
+    doubt: str = ""
+    """Why samples are no unsigned integers as LAS has them; empty where they are."""
 
     def digitizer(self, stored: Digitizer, packed: bool) -> Digitizer:
         """Return the digitizer of the counts that `read_packet_samples` gives."""
@@ -685,19 +694,53 @@ def find_forms(
             f"{min(big, small):.1f} DN, with the {second} bit first by {max(big, small):.1f} DN"
         )
     votes: dict[int, _Votes] = {}
+    wrong: dict[int, str] = {}
     for (index, length, packed), offsets in kinds.items():
         stored = digitizers[index]
         form = SampleForm(little=orders[index][0] if packed else False)
         samples = read_packet_samples(packets, offsets, length, stored, packed, form)
         tops = (stored.max_count, form.digitizer(stored, packed).max_count)
         votes.setdefault(index, _Votes()).add(samples, tops)
+        for edge in (samples, samples[:, ::-1]):
+            # Where the noise is cut off at a threshold, both ends have the same count.
+            flat = (edge[:, :LEAST_PADDING] == edge[:, :1]).all(axis=1) & (edge[:, -1] != edge[:, 0])
+            values, many = np.unique(edge[flat, 0], return_counts=True)
+            value = int(values[np.argmax(many)]) if many.max(initial=0) >= LEAST_VOTES else 0
+            rows = edge[flat & (edge[:, 0] == value)].astype(np.int64)
+            if value not in (0, *tops):
+                first = rows[np.arange(len(rows)), np.argmax(rows != value, axis=1)]
+                if median(np.abs(first - value)) >= FILL_STEP:
+                    wrong[index] = (
+                        f"{len(rows)} of {len(samples)} packets that were looked at begin or end with equal counts of "
+                        f"{value}, and a step: if these only fill packets up, echoes at the step are false; fill with 0"
+                    )
+        if packed or samples.dtype.itemsize == 1:
+            continue
+        # Counts may be multiples of a power of two, which make low bytes 0.
+        step = int(np.bitwise_or.reduce(samples, axis=None))
+        native, swapped = (
+            float(np.abs(np.diff(counts.astype(np.float64), axis=1)).sum())
+            for counts in (samples // samples.dtype.type(max(step & -step, 1)), samples.byteswap())
+        )
+        seem = "have their bytes in the other order (big-endian)" if SMOOTHER * swapped < native else ""
+        if samples.dtype.itemsize == 4 and samples.any():
+            bare = samples[samples != 0] & np.uint32(2**31 - 1)  # without the sign
+            least, most = quantile(bare, 0.01), quantile(bare, 0.99)
+            if FLOATS[0] < least < most - (1 << 23) < FLOATS[1] - (1 << 23):
+                seem = "be floating-point numbers"
+        if seem:
+            wrong[index] = (
+                f"samples seem to {seem}: they are read as LAS has them, as unsigned integers, so that amplitudes, "
+                "widths and noise are wrong; write them so"
+            )
     forms = {}
     for index in votes:
         inverted, why = _decide_direction(digitizers, votes, index)
         order, notes = orders.get(index, (False, ""))
         lines = tuple(f"descriptor {index}: {line}" for line in (notes, why) if line)
-        if inverted or lines:
-            forms[index] = SampleForm(order, inverted, lines)
+        doubt = f"descriptor {index}: {wrong[index]}" if index in wrong else ""
+        if inverted or lines or doubt:
+            forms[index] = SampleForm(order, inverted, lines, doubt)
     return forms
 
 

@@ -493,6 +493,8 @@ class Scanner:
         reasons = tally.describe()
         problems = list(decision.problems)
         doubts = {**tally.doubt(), **dict.fromkeys(decision.doubts, "units")}
+        forms = check.find_forms(facts.digitizers, self._packets, found.sample)
+        doubts |= {form.doubt: "packets" for form in forms.values() if form.doubt}
         fastest, slowest = check.USUAL_SPACINGS
         for kind, one in facts.digitizers.items():
             if tally.by_descriptor[kind] and (0 < one.spacing < fastest or slowest < one.spacing <= check.MAX_SPACING):
@@ -537,7 +539,7 @@ class Scanner:
             warnings=(*describe_oddities(reasons, tally.short), *decision.warnings, *doubts),
             doubts=doubts,
             problems=tuple(problems),
-            forms=check.find_forms(facts.digitizers, self._packets, found.sample),
+            forms=forms,
         )
 
     def _cut_units(self, first: int, last: int) -> Iterator[tuple[int, np.ndarray]]:
