@@ -80,6 +80,10 @@ WIDTH_BINS = LogBins(0.01, 0.01, 1200)
 """0.01 to 1600 ns, 1 % each."""
 _BINS = {"amplitude_dn": AMPLITUDE_BINS, "echo_width_ns": WIDTH_BINS}
 
+_NUMBERS = {name: name for name in ("copied_echoes", "strayed_returns", "unseen_returns")}
+_NUMBERS |= {"above_one": "reflectance_above_one", "last_left_out": "last_echoes_left_out"}
+"""Numbers of the quality of a report: field, and key of the file."""
+
 
 @frozen(eq=False)
 class RunReport:
@@ -202,11 +206,7 @@ class RunReport:
             "warnings": [asdict(one) for one in self.warnings],
             "quality": {
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
-                "reflectance_above_one": self.above_one,
-                "last_echoes_left_out": self.last_left_out,
-                "copied_echoes": self.copied_echoes,
-                "strayed_returns": self.strayed_returns,
-                "unseen_returns": self.unseen_returns,
+                **{key: getattr(self, name) for name, key in _NUMBERS.items()},
                 **histograms,
             },
         }
@@ -215,6 +215,7 @@ class RunReport:
     def from_json(cls, document: Mapping[str, Any]) -> RunReport:
         """Read a report that `to_json` wrote; raises KeyError, TypeError or ValueError for any other document."""
         counts, quality = document["counts"], document["quality"]
+        numbers: dict[str, Any] = {name: int(quality.get(key, 0)) for name, key in _NUMBERS.items()}
         histograms = {}
         for name, bins in _BINS.items():
             filled = quality[name]["histogram"]["counts"]
@@ -231,11 +232,7 @@ class RunReport:
             },
             remarks=tuple(str(line) for line in document["remarks"]),
             warnings=tuple(StripWarning(str(one["code"]), str(one["text"])) for one in document["warnings"]),
-            above_one=int(quality.get("reflectance_above_one", 0)),
-            last_left_out=int(quality.get("last_echoes_left_out", 0)),
-            copied_echoes=int(quality.get("copied_echoes", 0)),
-            strayed_returns=int(quality.get("strayed_returns", 0)),
-            unseen_returns=int(quality.get("unseen_returns", 0)),
+            **numbers,
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=histograms["amplitude_dn"],
             echo_width=histograms["echo_width_ns"],

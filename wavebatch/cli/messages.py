@@ -215,8 +215,8 @@ def talk(*messages: str) -> None:
 
 
 def tell(message: str) -> None:
-    """As `talk`; with --quiet in the file of --log-file only."""
-    if not click.get_current_context().params["quiet"]:
+    """As `talk`; with --quiet in the file of --log-file only, unless it is a warning."""
+    if "warning: " in message or not click.get_current_context().params["quiet"]:
         write_message(printable(message))
     log_text(printable(message))
 

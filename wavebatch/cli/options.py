@@ -273,11 +273,8 @@ def find_inputs(arguments: Iterable[Path | str], **how: Any) -> list[Path]:
 
 
 def note_input(line: str) -> None:
-    """A line about the arguments; a warning is said with --quiet, too."""
-    if line.startswith("warning: "):
-        talk(line)
-    else:
-        tell(f"note: {line}")
+    """A line about the arguments."""
+    tell(line if line.startswith("warning: ") else f"note: {line}")
 
 
 INPUT = click.Path(path_type=Path, readable=False)

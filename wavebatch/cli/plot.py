@@ -179,16 +179,20 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
 
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
     """Clouds, one file of voxels, or files of segments: these from a folder or pattern where it has no clouds."""
-    from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, check_alone, is_segments
+    from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, is_segments
 
     kinds = (SUFFIXES, SEGMENT_SUFFIXES) if or_segments else (SUFFIXES,)
     paths = shared.find_inputs(clouds, recursive=options["recursive"], kinds=kinds)
     segments = [path for path in paths if is_segments(path)]
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
-    if segments and or_segments:
-        check_alone(paths, options)
-    elif segments:
+    if segments and not or_segments:
         raise ConfigError(f"{segments[0]}: segments have no side view; use `plot profile`, or `slice --overview`")
+    if segments and len(segments) < len(paths):
+        others = [path for path in paths if not is_segments(path)]
+        raise ConfigError(f"{others[0]}: segments are drawn without clouds; draw these in another picture")
+    for name in ("flags", "drop_flags", "where") if segments else ():
+        if options[name]:
+            raise ConfigError(f"{segments[0]}: --{name.replace('_', '-')} selects points; segments have none")
     if voxels and options["where"] is not None:
         raise ConfigError(f"{voxels[0]}: --where is for points; give it to `wavebatch voxelize`")
     return paths

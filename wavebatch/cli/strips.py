@@ -81,7 +81,7 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
             width = f" {sent['fwhm_ns']:.3f} ns wide at half maximum," if math.isfinite(sent["fwhm_ns"]) else ":"
             tell(f"{place}: outgoing pulses{width} energies vary by {spread:.2f} %, known to {error:.2f} %")
         for note in summary.notes:
-            (talk if note.startswith("warning:") else tell)(f"{place}: {note}")
+            tell(f"{place}: {note}")
         return summary
 
     # A single file that fails is one line too, with the exit code of a batch.
@@ -125,10 +125,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
         numbers = f"{count(summary.points, 'point')} and {count(summary.waveforms, 'waveform')}"
         tell(f"{summary.output}: {numbers}")
         for line in summary.repaired:
-            if line.startswith("warning:"):
-                talk(f"{summary.output}: {line}")
-            else:
-                tell(f"{summary.output}: repaired: {line}")
+            tell(f"{summary.output}: {'' if line.startswith('warning: ') else 'repaired: '}{line}")
         return summary
 
     summaries, failed = shared.for_each(paths, work, debug=options["debug"])

@@ -32,6 +32,12 @@ def even_places(number: int, most: int) -> np.ndarray:
     return distinct(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))
 
 
+def join_ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """The numbers start, start + 1, ..., start + count - 1 of all ranges, one behind the other."""
+    ends = np.cumsum(counts)
+    return np.arange(ends[-1] if len(ends) else 0) + np.repeat(starts - (ends - counts), counts)
+
+
 def draw(seed: int, *shape: int) -> np.ndarray:
     """Numbers between 0 and 1 that look like chance, float64 of a shape: always the same for a seed."""
     source, size, most = Random(seed), 4 * int(np.prod(shape)), 1 << 24  # 2^28 bytes at once are an OverflowError

@@ -11,7 +11,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import robust_std
+from wavebatch.core.order import join_ranges, robust_std
 
 TOLERANCE_NS = 1.5
 """A found and a true echo further apart than this are not the same echo."""
@@ -85,8 +85,7 @@ def list_pairs(
     start = np.searchsorted(ordered, key_b - reach, side="left")
     number = np.searchsorted(ordered, key_b + reach, side="right") - start
     right = np.repeat(np.arange(len(group_b)), number)
-    within = np.arange(len(right)) - np.repeat(np.cumsum(number) - number, number)
-    left = order[np.repeat(start, number) + within]
+    left = order[join_ranges(start, number)]
     same = (group_a[left] == group_b[right]) & (np.abs(value_a[left] - value_b[right]) <= tolerance)
     return left[same], right[same]
 
@@ -174,10 +173,13 @@ def find_isolated_echoes(truth: EchoTable) -> np.ndarray:
     bool array, shape (m,)
         True for isolated echoes.
     """
+    bad = truth.flags & np.uint16(EchoFlag.OVERLAPPED | EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)
+    return ~(has_neighbour(truth, ISOLATED) | (bad != 0))
+
+
+def has_neighbour(truth: EchoTable, reach: float) -> np.ndarray:
+    """Find true echoes, bool (m,), with another one of their waveform within so many sigma of the wider of both."""
     sigma = truth.sigma.astype(np.float64)
-    close = np.diff(truth.time) < ISOLATED * np.maximum(sigma[1:], sigma[:-1])
+    close = np.diff(truth.time) < reach * np.maximum(sigma[1:], sigma[:-1])
     close &= np.diff(truth.waveform) == 0
-    bad = (truth.flags & np.uint16(EchoFlag.OVERLAPPED | EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) != 0
-    bad[1:] |= close
-    bad[:-1] |= close
-    return ~bad
+    return np.append(close, False)[: len(truth)] | np.append(False, close)[: len(truth)]

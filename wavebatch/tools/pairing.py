@@ -29,7 +29,7 @@ from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, s
 from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
-from wavebatch.tools.return_stats import pulses_told_apart
+from wavebatch.tools.return_stats import times_separate_pulses
 from wavebatch.tools.simulate.render import full_sigma
 from wavebatch.tools.simulate.strip import TruthReader
 
@@ -177,7 +177,7 @@ LEAST_SHARED = 0.05
 
 def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, in_memory: int = BUCKET_ROWS) -> CloudTask:
     """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
-    by_time = pulses_told_apart(first) and pulses_told_apart(second)
+    by_time = times_separate_pulses(first) and times_separate_pulses(second)
     if by_time:
         # Formats round times differently: those of one flight in two formats are equal by chance only. So enough pulses
         # of the first piece of the shorter cloud must be in the other cloud.

@@ -391,7 +391,7 @@ def count_returns(
     return each, total.finish("total")
 
 
-def pulses_told_apart(reader: CloudReader) -> bool:
+def times_separate_pulses(reader: CloudReader) -> bool:
     """Whether the GPS times of the first points separate pulses."""
     if not reader.has_gps_time:
         return False
@@ -401,7 +401,7 @@ def pulses_told_apart(reader: CloudReader) -> bool:
 
 def _tally_cloud(path: Path, divisions: Sequence[Division], selection: PointFilter, in_memory: int) -> _Tally:
     with CloudReader(path, RETURN_DTYPE) as reader:
-        by_time = pulses_told_apart(reader)  # by all points
+        by_time = times_separate_pulses(reader)  # by all points
         reader.select(selection)
         placed = [one.place(path) if isinstance(one, PolygonSet) else (one, "") for one in divisions]
         areas = [AreaTally(division) for division, _ in placed]

@@ -16,11 +16,11 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import join_ranges
 from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.files.strip.scanner import expand
 from wavebatch.kernels.geometry.group_returns import find_pulses
 from wavebatch.kernels.geometry.slice_lines import find_lines, find_sweeps
 
@@ -159,7 +159,7 @@ def _shape(block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
 def _take(pulses: np.ndarray, samples: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Some pulses with only their samples."""
     first = np.cumsum(pulses["count"]) - pulses["count"]
-    return pulses[rows], samples[expand(first[rows], pulses["count"][rows])]
+    return pulses[rows], samples[join_ranges(first[rows], pulses["count"][rows])]
 
 
 def find_main_axis(apart: np.ndarray) -> np.ndarray:

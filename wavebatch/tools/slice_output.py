@@ -444,13 +444,3 @@ class SegmentFiles:
     def complain(self, tally: Tally) -> InputError:
         """The error that says why nothing can be drawn."""
         return InputError(f"{self.paths[0]}: holds no segment: nothing to draw")
-
-
-def check_alone(paths: Sequence[Path], options: dict) -> None:
-    """Raises ConfigError where segments come with clouds, or with options that select points."""
-    mixed = [path for path in paths if not is_segments(path)]
-    if mixed:
-        raise ConfigError(f"{mixed[0]}: segments are drawn without clouds; draw these in another picture")
-    for name in ("flags", "drop_flags", "where"):
-        if options[name]:
-            raise ConfigError(f"{paths[0]}: --{name.replace('_', '-')} selects points; segments have none")

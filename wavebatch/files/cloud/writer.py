@@ -303,7 +303,7 @@ def plan_output(
     # "no data".
     at, copies = las.STANDARD_DTYPES[checked.header.point_format].itemsize, []
     readable = [record.with_readable_texts() for record in checked.records]
-    for record in las.tell_apart(readable, checked.header.point_format):
+    for record in las.name_uniquely(readable, checked.header.point_format):
         empty = None if whole else las.choose_no_data(record)
         marked = record if empty is None else record.with_no_data(empty)
         copies.append(Carried(marked, at, copied=not whole and empty is None))

@@ -637,7 +637,7 @@ def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
     return records
 
 
-def tell_apart(records: Sequence[ExtraRecord], point_format: int) -> list[ExtraRecord]:
+def name_uniquely(records: Sequence[ExtraRecord], point_format: int) -> list[ExtraRecord]:
     """Return the records with names that no other one and no field of the format has: laspy opens no other file.
 
     A name that is taken, or empty, gets " 2", " 3" ... at its end, as in `build_dtype`.

@@ -18,7 +18,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import distinct, even_places, find_order, quantile
+from wavebatch.core.order import distinct, even_places, find_order, join_ranges, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
@@ -410,7 +410,7 @@ class _Geometry:
     ) -> WaveformBlock:
         """Return the block of packets `rows`; the first return of each packet is its owner."""
         counts = self._counts[rows]
-        place = scanner.expand(self._starts[rows], counts)
+        place = join_ranges(self._starts[rows], counts)
         if self._all is None:
             unit = self._unit
             self._all = join_records(unit.points, unit.context) if len(unit.context) else unit.points

@@ -21,7 +21,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import changeable, frozen
-from wavebatch.core.order import distinct, even_places, quantile
+from wavebatch.core.order import distinct, even_places, join_ranges, quantile
 from wavebatch.core.units import count
 from wavebatch.files.disk.raw_bytes import Closing, join_records, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
@@ -82,13 +82,6 @@ def group_keys(keys: np.ndarray) -> PacketGroups:
     return PacketGroups(order, starts, np.diff(np.append(starts, len(keys))))
 
 
-def expand(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return start, start + 1, ..., start + count - 1 of all pairs in one array."""
-    total = int(counts.sum())
-    begin = np.cumsum(counts) - counts
-    return np.arange(total) + np.repeat(starts - begin, counts)
-
-
 def cross_units(groups: PacketGroups, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs (unit, entry): the entry shares a key with entries of that unit, but lies in another unit.
 
@@ -98,13 +91,13 @@ def cross_units(groups: PacketGroups, unit: np.ndarray) -> tuple[np.ndarray, np.
     last = lead + groups.counts - 1
     crossing = unit[groups.order[lead]] != unit[groups.order[last]]
     starts, counts = lead[crossing], groups.counts[crossing]
-    members = groups.order[expand(starts, counts)]
+    members = groups.order[join_ranges(starts, counts)]
     group = np.repeat(np.arange(len(starts)), counts)
     first = np.ones(len(members), bool)
     first[1:] = (group[1:] != group[:-1]) | (unit[members[1:]] != unit[members[:-1]])
     place = np.cumsum(counts) - counts
     targets, owners = unit[members[first]], group[first]
-    rows = expand(place[owners], counts[owners])
+    rows = join_ranges(place[owners], counts[owners])
     target = np.repeat(targets, counts[owners])
     away = unit[members[rows]] != target
     return target[away], members[rows[away]]
@@ -671,7 +664,7 @@ class Scanner:
                     entries = np.concatenate([entries, part])
                     groups = group_keys(entries["key"])
                     if (groups.counts > MAX_RETURNS + 1).any():
-                        keep = groups.order[expand(groups.starts, np.minimum(groups.counts, MAX_RETURNS + 1))]
+                        keep = groups.order[join_ranges(groups.starts, np.minimum(groups.counts, MAX_RETURNS + 1))]
                         entries = entries[np.sort(keep)]
                 groups = group_keys(entries["key"])
                 packets += len(groups.starts)

@@ -43,6 +43,7 @@ from wavebatch.batch.workers.spawned import Call, PipedProcess, start_early, tak
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError, advise_install
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import join_ranges
 from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, option
 from wavebatch.core.units import QUANTISATION_STD
@@ -51,7 +52,6 @@ from wavebatch.files.disk.publish import reporting
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
 from wavebatch.files.strip.reader import SAMPLE, StripReader
-from wavebatch.files.strip.scanner import expand
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain import STAGES, Chain, Step, effective, load_chain_file, load_profile
 from wavebatch.stages.score import QUANTITIES
@@ -270,7 +270,7 @@ class StripScene(Scene):
         chosen = rng.integers(0, len(sample.count), n)
         count = sample.count[chosen]
         waveform = np.repeat(np.arange(n), count)
-        row = expand(sample.first[chosen], count)
+        row = join_ranges(sample.first[chosen], count)
         start = sample.time[np.repeat(sample.first[chosen], count)]
         stretch = np.exp(JITTER * rng.standard_normal(n))[waveform]
         shift = rng.uniform(-0.5, 0.5, n)[waveform] * recording.spacing

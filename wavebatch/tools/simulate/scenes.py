@@ -24,6 +24,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.units import AIR_SPEED, FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.physics.radiometry import transmit
+from wavebatch.stages.score import has_neighbour
 from wavebatch.tools.simulate.render import (
     GROUND,
     FlightLine,
@@ -624,14 +625,8 @@ def simulate_pulses(scene: Scene, n: int, rng: np.random.Generator, *, first: in
 
 def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
     """The truth with flags for what makes an echo hard to find: OVERLAPPED, NEAR_EDGE, SATURATED, WEAK."""
-    sigma = truth.sigma.astype(np.float64)
-    close = np.diff(truth.time) < NEIGHBOUR * np.maximum(sigma[1:], sigma[:-1])
-    close &= np.diff(truth.waveform) == 0
-    overlapped = np.zeros(len(truth), bool)
-    overlapped[1:] |= close
-    overlapped[:-1] |= close
     depth = np.minimum(truth.time, recording.duration - truth.time)
-    truth = truth.with_flags(EchoFlag.OVERLAPPED, overlapped)
-    truth = truth.with_flags(EchoFlag.NEAR_EDGE, depth < EDGE * sigma)
+    truth = truth.with_flags(EchoFlag.OVERLAPPED, has_neighbour(truth, NEIGHBOUR))
+    truth = truth.with_flags(EchoFlag.NEAR_EDGE, depth < EDGE * truth.sigma.astype(np.float64))
     truth = truth.with_flags(EchoFlag.SATURATED, truth.amplitude + recording.baseline > recording.clip)
     return truth.with_flags(EchoFlag.WEAK, truth.amplitude < WEAK * recording.recorded_noise)

@@ -32,13 +32,12 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import quantile
+from wavebatch.core.order import join_ranges, quantile
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
 from wavebatch.files.las.header import locate, read_scanner
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
-from wavebatch.files.strip.scanner import expand
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, along_ray, find_rays, group_times, on_ray
 from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.kernels.physics import radiometry
@@ -490,7 +489,7 @@ class Rays:
     def take(self, rows: np.ndarray | slice) -> Rays:
         """Some of the rays."""
         table = self.table[rows]
-        samples = self.samples[expand(table["first"], table["count"])]
+        samples = self.samples[join_ranges(table["first"], table["count"])]
         table["first"] = np.cumsum(table["count"]) - table["count"]
         return Rays(table, samples)
 
@@ -597,7 +596,7 @@ def _find_known(
     group = np.sort(packets["group"])
     number = np.searchsorted(group, lost["group"], "right") - (low := np.searchsorted(group, lost["group"]))
     one = np.repeat(np.arange(len(lost)), number)
-    packet = np.argsort(packets["group"], kind="stable")[expand(low, number)]
+    packet = np.argsort(packets["group"], kind="stable")[join_ranges(low, number)]
     own = ray[packet]
     start, step = table["start"][own], table["step"][own]
     near = (lost["scanner"][one] == table["scanner"][own]) & on_ray(lost["place"][one], start, step)
@@ -658,7 +657,7 @@ class LightRule:
     ratio: float = 1.0
     """Reflectance of canopy over that of ground."""
     error: float | None = None
-    """Its standard deviation, with what `hold_lost` adds; None where it was assumed."""
+    """Its standard deviation, with what `add_lost_light` adds; None where it was assumed."""
     source: str = "assumed"
     """`given`, `strip`, `assumed` (1, because the strip does not show it), or `no canopy`."""
     usual: float = 0.0
@@ -715,7 +714,7 @@ def find_rule(sample: Iterable[Rays], given: float | None) -> LightRule:
     )
 
 
-def hold_lost(rule: LightRule, sample: Sequence[Rays], louder: Sequence[Rays], given: float | None) -> LightRule:
+def add_lost_light(rule: LightRule, sample: Sequence[Rays], louder: Sequence[Rays], given: float | None) -> LightRule:
     """The rule with an error that holds the light that noise hides, from rays in their noise and with more of it.
 
     Weak ground below leaves, or weak leaves, are lost in the noise, which then counts as light of the other, and moves

@@ -258,7 +258,7 @@ def voxelize_strip(
             sample.append(tracer.trace(batch))
             louder.append(tracer.trace(batch, rng))
         rule = rays.find_rule(sample, options.reflectance_ratio)
-        rule = rays.hold_lost(rule, sample, louder, options.reflectance_ratio)
+        rule = rays.add_lost_light(rule, sample, louder, options.reflectance_ratio)
         most_bits = max(digitizer.bits for digitizer in reader.facts.digitizers.values() if digitizer.n_samples)
         anchor = np.floor(middle / options.size).astype(np.int64)
         # Parts of the voxels, in their order, begin at some of the lowest returns, each of which stands for its cell.
