@@ -46,12 +46,12 @@ _FLOATS = ["0", "-0.0", "-1", "1", "0.5", "2", "1e-9", "1e-300", "1e9", "1e300",
            "", " ", "1,5", "x", "1e", "0x1p3", "100", "1000", "٣", "1_0", "9" * 400]  # fmt: skip
 _TEXTS = {
     "where": 'number_of_returns == 2 and not (classification == 7 or echo_width >= 8.5) or "amplitude" < -1e3',
-    "bbox": "300000,5000000,300100,5000100", "bounds": "300000,5000000,300100,5000100", "columns": "+range,+amplitude",
-    "column": "amplitude", "classes": "2,6-9", "drop_flags": "RINGING_SUSPECT,WEAK", "flags_with": "SATURATED,WEAK",
-    "flags_without": "WEAK", "lever_arm": "0.1,-0.2,0.5", "crs": "EPSG:32632", "lines": "0:3", "packet": "0:3",
-    "times": "0:20", "value_range": "0:100", "memory": "2G", "tolerance": "0.02m", "profile": "accurate",
-    "line": "300000,5000000,300100,5000100", "energy": "intensity", "no_data": "-9999.0", "gps_time": "1.5",
-    "by": "number_of_returns", "scene": "forest", "hazard": "H3", "area": "5",
+    "bbox": "300000,5000000,300100,5000100", "columns": "+range,+amplitude", "column": "amplitude", "classes": "2,6-9",
+    "drop_flags": "RINGING_SUSPECT,WEAK", "flags": "SATURATED,WEAK", "lever_arm": "0.1,-0.2,0.5", "crs": "EPSG:32632",
+    "lines": "0:3", "packets": "0:3", "shown": "0:20", "limits": "0:100", "memory": "2G", "tolerance": "0.02m",
+    "profile": "accurate", "line": "300000,5000000,300100,5000100", "energy": "intensity", "by": "number_of_returns",
+    "fail_on": "pulse-guess,lost-packets", "show": "detector", "scenes": "forest", "widths": "echo_width",
+    "shares": "equal",
 }  # fmt: skip
 _PLACES = [
     "{out}", "{out}/x", "{out}/x.las", "{out}/x.laz", "{out}/x.csv", "{out}/x.npz", "{out}/x.toml", "{out}/x.tif",
@@ -69,10 +69,10 @@ _READ = ["{base}", "{base}/strip.las", "{base}/cloud.laz", "{base}/truth.npz", "
 _WRITTEN = [place for place in _PLACES if "{base}" not in place]
 """Outputs may replace other files, but not the sound inputs of all cases."""
 
-_NEVER = ("debug", "scheduler", "help", "against", "real", "promises", "large", "all_methods", "peers", "stability")
+_NEVER = ("debug", "scheduler", "all_methods")
 """Print tracebacks, wait for a network, or take minutes by design."""
 
-_MANY = ("pulses", "waveforms", "repeats", "iterations", "jobs", "samples")
+_MANY = ("pulses", "waveforms", "repeats", "iterations", "n_samples")
 """A large number makes more work, as it should."""
 
 
@@ -93,6 +93,8 @@ class Options:
     def __init__(self) -> None:
         self._commands = dict(list_commands())
         assert set(self._commands) == set(SOUND), "a new command needs a line in SOUND"
+        names = {one.name for command in self._commands.values() for one in command.params}
+        assert not {*_TEXTS, *_NEVER, *_MANY} - names, "no option has this name"
         self._weights = [WEIGHTS.get(name.split()[0], 1.0) for name in self._commands]
 
     def draw(self, rng: random.Random) -> tuple[str, dict[str, str]]:
