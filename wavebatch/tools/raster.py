@@ -287,6 +287,21 @@ def _zeroed(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, 0.0)
 
 
+def _find_common_crs(paths: Sequence[Path]) -> tuple[str | None, str, list[Path]]:
+    """The CRS of all clouds, the unit of their coordinates, and those without a CRS where others have one."""
+    unit, unnamed, first = "m", [], None
+    for path in paths:
+        found = read_crs_definition(path, read_checked_header(path, waveforms=False).header)
+        if found is None:
+            unnamed.append(path)
+            continue
+        unit = find_crs_unit(found, str(path))
+        if first and first[1] != found and parse_crs(first[1], str(path)) != parse_crs(found, str(path)):
+            raise ConfigError(f"{path}: has another CRS than {first[0]}; make a raster of each, or give --crs")
+        first = first or (path, found)
+    return (None, unit, []) if first is None else (first[1], unit, unnamed)
+
+
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
 """Most cells along a side, and of the raster (300 km x 300 km at 1 m): more is damage of coordinates, clouds of several
 projects, or a size that was meant in another unit."""
@@ -361,21 +376,11 @@ def write_grid(
         units = read_crs(path, read_checked_header(path, waveforms=False).header)[1]
         if any(one.kind == "geocentric" for one in units):
             raise ConfigError(f"{path}: coordinates are geocentric (ECEF): x and y are no map; project the clouds")
-    crs, unit, unnamed = options.crs, "m", []
-    if crs is not None:
+    crs, unnamed = options.crs, []
+    if crs is None:
+        crs, unit, unnamed = _find_common_crs(paths)
+    else:
         unit = find_crs_unit(crs, "--crs")
-    else:  # that of all clouds
-        first: tuple[Path, str] | None = None
-        for path in paths:
-            found = read_crs_definition(path, read_checked_header(path, waveforms=False).header)
-            if found is None:
-                unnamed.append(path)
-                continue
-            unit = find_crs_unit(found, str(path))
-            if first and first[1] != found and parse_crs(first[1], str(path)) != parse_crs(found, str(path)):
-                raise ConfigError(f"{path}: has another CRS than {first[0]}; make a raster of each, or give --crs")
-            first = first or (path, found)
-        crs, unnamed = (None, []) if first is None else (first[1], unnamed)
     if metrics is not None and unit != "m":
         raise ConfigError(f"{paths[0]}: --forest: voxels are measured in metres, and coordinates are in {unit}; "
                           "project the strip to a CRS in metres first")  # fmt: skip

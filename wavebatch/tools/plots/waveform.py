@@ -505,13 +505,14 @@ def format_echoes(views: Sequence[WaveformView]) -> str:
     for view in views:
         place = [view.packet if view.packet >= 0 else "", view.point, f"{view.gps_time:.9f}"]
         for row in range(len(view.echoes)):
-            texts = [_cell(value, 9) for pair in _measures(view, row) for value in pair]
-            texts += [_cell(_column(view, name)[row], 9 if name not in ("x", "y", "z") else 13) for name in rest]
+            values = [value for pair in _measures(view, row) for value in pair]
+            found = {name: _column(view, name)[row] for name in rest}
+            found |= {name: f"{found[name]:.13g}" for name in "xyz" if math.isfinite(found.get(name, math.nan))}
             flags = " ".join(flag.name for flag in EchoFlag(int(view.echoes.flags[row])))
-            table.append([*place, row + 1, *texts, flags])
+            table.append([*place, row + 1, *values, *found.values(), flags])
         if not len(view.echoes):
             table.append([*place, *[""] * (len(head) - 2)])
-    return format_csv([*head, "flags"], table)
+    return format_csv([*head, "flags"], table, digits=9)
 
 
 def _measures(view: WaveformView, row: int) -> Iterator[tuple[float, float]]:
@@ -524,8 +525,3 @@ def _measures(view: WaveformView, row: int) -> Iterator[tuple[float, float]]:
 def _column(view: WaveformView, name: str) -> np.ndarray:
     """An attribute column of the echoes; NaN if the chain does not compute it."""
     return np.asarray(view.echoes.attributes.get(name, np.full(len(view.echoes), np.nan)), np.float64)
-
-
-def _cell(value: float, digits: int) -> str:
-    """The value with so many digits; empty for no data."""
-    return f"{value:.{digits}g}" if math.isfinite(value) else ""

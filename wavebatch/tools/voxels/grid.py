@@ -413,17 +413,18 @@ SAMPLE_COLUMNS = {
 
 
 class ProfileWriter(NpzWriter):
-    """Writes profiles batch by batch: `add_rays` for each, then `complete_profiles`."""
+    """Writes profiles batch by batch: `add_rays` for each, then `complete`."""
 
     def __init__(self, target: Path, strip: Path, *, sections: bool, overwrite: bool) -> None:
         if target.suffix.lower() != ".npz":
             raise ConfigError(f"--profiles {target}: profiles are written as .npz")
         self._names = [name for name in SAMPLE_COLUMNS if sections or name != "cross_section"]
         columns = {**PULSE_COLUMNS, **{name: SAMPLE_COLUMNS[name] for name in self._names}}
-        self._meanings = {name: meaning for name, (_, meaning) in columns.items()}
+        self.meanings = {name: meaning for name, (_, meaning) in columns.items()}
+        """Of the columns."""
         with protecting([strip]):
             super().__init__(target, {name: dtype for name, (dtype, _) in columns.items()}, overwrite=overwrite)
-        self.pulses = self.samples = 0
+        self.samples = 0
 
     def add_rays(self, rays: Rays) -> None:
         """Adds the pulses that have signal."""
@@ -434,13 +435,7 @@ class ProfileWriter(NpzWriter):
         if "cross_section" in self._names:
             values["cross_section"] = np.where(table["unknown"][rays.owner], np.nan, samples["section"])
         self.add(values)
-        self.pulses += len(table)
         self.samples += len(samples)
-
-    def complete_profiles(self, meta: Mapping[str, Any], crs: str) -> Draft:
-        """Writes the file, with how it was made as JSON in `meta`."""
-        text = json.dumps({**meta, "columns": self._meanings}, sort_keys=True)
-        return self.complete({"crs": crs, "meta": text})
 
 
 _PIECE = 1_000_000

@@ -23,7 +23,7 @@ them, whether recorded or not.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple
@@ -657,7 +657,7 @@ class LightRule:
     ratio: float = 1.0
     """Reflectance of canopy over that of ground."""
     error: float | None = None
-    """Its standard deviation, with what `add_lost_light` adds; None where it was assumed."""
+    """Its standard deviation, with what noise hides; None where it was assumed."""
     source: str = "assumed"
     """`given`, `strip`, `assumed` (1, because the strip does not show it), or `no canopy`."""
     usual: float = 0.0
@@ -684,8 +684,13 @@ class LightRule:
         return light / whole, ground / whole
 
 
-def find_rule(sample: Iterable[Rays], given: float | None) -> LightRule:
-    """The rule by which signal counts as light, from the rays of a sample of the pulses."""
+def find_rule(sample: Sequence[Rays], given: float | None, louder: Sequence[Rays] = ()) -> LightRule:
+    """The rule by which signal counts as light, from the rays of a sample of the pulses.
+
+    louder: the same rays in more noise; the error of the ratio then holds the light that noise hides. Weak ground below
+    leaves, or weak leaves, are lost in the noise, which then counts as light of the other, and moves the ratio.
+    Simulated, noise 1.4 times as strong loses about as much as is lost already.
+    """
     pulses, packets = [np.zeros((2, 0))], [np.zeros((4, 0))]
     for rays in sample:
         owner, n = rays.owner, len(rays.table)
@@ -707,24 +712,16 @@ def find_rule(sample: Iterable[Rays], given: float | None) -> LightRule:
     light = canopy + rule.ratio * ground
     part, part_ground, whole, whole_ground = np.concatenate(packets, axis=1)
     share = (part + rule.ratio * part_ground) / (whole + rule.ratio * whole_ground)
-    return replace(
+    rule = replace(
         rule,
         usual=float(light[light > 0].mean()) if (light > 0).any() else 0.0,
         hidden_light=float(np.quantile(share, WEAKEST)) if len(share) else None,
     )
-
-
-def add_lost_light(rule: LightRule, sample: Sequence[Rays], louder: Sequence[Rays], given: float | None) -> LightRule:
-    """The rule with an error that holds the light that noise hides, from rays in their noise and with more of it.
-
-    Weak ground below leaves, or weak leaves, are lost in the noise, which then counts as light of the other, and moves
-    the ratio. Simulated, noise 1.4 times as strong loses about as much as is lost already.
-    """
-    if rule.source not in ("strip", "given"):
+    if not louder or rule.source not in ("strip", "given"):
         return rule
-    light = [[sum(one.samples[name].sum() for one in traced) for name in ("canopy", "ground")]
-             for traced in (sample, louder)]  # fmt: skip
-    before, after = np.array([[*light[0], rule.ratio], [*light[1], find_rule(louder, given).ratio]])
+    sums = [[sum(one.samples[name].sum() for one in traced) for name in ("canopy", "ground")]
+            for traced in (sample, louder)]  # fmt: skip
+    before, after = np.array([[*sums[0], rule.ratio], [*sums[1], find_rule(louder, given).ratio]])
     known = before > 0
     lost = np.log(np.maximum(after[known] / before[known], LEAST_LEFT))
     return replace(rule, error=rule.ratio * math.hypot(rule.log_error, *lost.tolist()))

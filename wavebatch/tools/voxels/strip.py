@@ -6,6 +6,7 @@ output must not depend on batches, so nothing here may mix pulses of a batch.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -23,7 +24,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, count
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import Radiometry, SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
 from wavebatch.files.disk.temp_store import ROWS_IN_MEMORY
@@ -212,14 +213,7 @@ def voxelize_strip(
                 )
             beam = sample_reference(reader, scan, source, pulse, setup.choice.survey.figures.spacing_ns or 0.0)
             doubts += tuple(filter(None, [source.doubt(), beam.doubt()]))
-            # The relative error that all cross sections share: of constant, air, ranges and beam.
-            light = setup.system.radiometry
-            constant = max((error for _, error in light.channels.values()), default=light.constant_error)
-            shared = backscatter_error(
-                np.zeros(1), np.array([source.distance or USUAL]), light.sensor_error, constant, light.attenuation,
-                power=4, attenuation_err=light.attenuation_error,
-            )  # fmt: skip
-            section_error = math.hypot(float(shared[0]), 2.0 * (beam.doubt_error() or light.divergence_error))
+            section_error = _share_error(setup.system.radiometry, source.distance or USUAL, beam.doubt_error())
         middle = _find_middle(reader, scan, options)
         floor, ceiling, shown = rays.Floor(middle), rays.Ceiling(middle, options.size), np.zeros(256, np.int64)
         for begin, end in pairwise(scan.borders.tolist()):
@@ -233,21 +227,8 @@ def voxelize_strip(
             reader, source, pulse, options, floor.finish(), ceiling.finish(), energy, calibration is not None
         )
         footprint = 1e-3 * (pulse.radiometry.divergence or 0.0) * (source.distance or 0.0)
-        assumed, wide = "" if footprint else " (assumed, as beam or range are not known)", footprint or WIDE
-        # Half of it rises to the edge of a footprint; the planes are not known better than to the other half.
-        if options.forest and wide * floor.steep > options.ground_height:
-            doubts += (
-                f"on slopes of {math.degrees(math.atan(floor.steep)):.0f} degrees, ground in footprints of {wide:.2g} "
-                f"m{assumed} reaches above --ground-height {options.ground_height:g} and counts as plants, so that "
-                "cover and leaf area are too large: give --ground-height "
-                f"{options.ground_height + 0.5 * wide * floor.steep:.1f}",
-            )
-        if options.forest and not 0.0 < footprint < TOO_WIDE:
-            which = f"of {footprint:.2g} m" if footprint else "of unknown width (give --system with divergence_mrad)"
-            doubts += (
-                f"leaf areas: footprints {which} do not show narrower gaps between leaves: where crowns are no wider, "
-                "leaf areas are too small by more than their errors",
-            )
+        if options.forest:
+            doubts += (*_doubt_footprints(footprint, floor.steep, options.ground_height),)
         numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
         each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
         batches = rays.read_batches(
@@ -257,8 +238,7 @@ def voxelize_strip(
         for batch in batches:
             sample.append(tracer.trace(batch))
             louder.append(tracer.trace(batch, rng))
-        rule = rays.find_rule(sample, options.reflectance_ratio)
-        rule = rays.add_lost_light(rule, sample, louder, options.reflectance_ratio)
+        rule = rays.find_rule(sample, options.reflectance_ratio, louder)
         most_bits = max(digitizer.bits for digitizer in reader.facts.digitizers.values() if digitizer.n_samples)
         anchor = np.floor(middle / options.size).astype(np.int64)
         # Parts of the voxels, in their order, begin at some of the lowest returns, each of which stands for its cell.
@@ -304,8 +284,9 @@ def voxelize_strip(
             # Profiles and voxels, or neither.
             others = []
             if writer is not None:
-                known = {name: value for name, value in meta.items() if name not in ("columns", "size_m", "headroom_m")}
-                others.append(writer.complete_profiles(known, space.facts.crs or ""))
+                known = {name: value for name, value in meta.items() if name not in ("size_m", "headroom_m")}
+                text = json.dumps({**known, "columns": writer.meanings}, sort_keys=True)
+                others.append(writer.complete({"crs": space.facts.crs or "", "meta": text}))
             write = voxel_grid.write_npz if target.suffix.lower() == ".npz" else voxel_grid.write_las
             summary.voxels = write(target, space, grid.pieces(rule.log_error), others, overwrite)
             summary.profile_samples = 0 if writer is None else writer.samples
@@ -321,6 +302,34 @@ def voxelize_strip(
             split = summary.several_packets > 0 or scan.with_waveform == scan.packets
             summary.warnings += (*_doubt_returns(shown.reshape(16, 16), summary.pulses, split),)
             return summary
+
+
+def _share_error(light: Radiometry, distance: float, beam: float | None) -> float:
+    """The relative error that all cross sections share: of constant, air, ranges and beam; beam: of the divergence."""
+    constant = max((error for _, error in light.channels.values()), default=light.constant_error)
+    shared = backscatter_error(
+        np.zeros(1), np.array([distance]), light.sensor_error, constant, light.attenuation, power=4,
+        attenuation_err=light.attenuation_error,
+    )  # fmt: skip
+    return math.hypot(float(shared[0]), 2.0 * (beam or light.divergence_error))
+
+
+def _doubt_footprints(footprint: float, steep: float, ground_height: float) -> Iterator[str]:
+    """Say that footprints [m], 0 where not known, are too wide for the slope (rise per metre) or for the crowns."""
+    assumed, wide = "" if footprint else " (assumed, as beam or range are not known)", footprint or WIDE
+    # Half of it rises to the edge of a footprint; the planes are not known better than to the other half.
+    if wide * steep > ground_height:
+        yield (
+            f"on slopes of {math.degrees(math.atan(steep)):.0f} degrees, ground in footprints of {wide:.2g} m{assumed} "
+            f"reaches above --ground-height {ground_height:g} and counts as plants, so that cover and leaf area are "
+            f"too large: give --ground-height {ground_height + 0.5 * wide * steep:.1f}"
+        )
+    if not 0.0 < footprint < TOO_WIDE:
+        which = f"of {footprint:.2g} m" if footprint else "of unknown width (give --system with divergence_mrad)"
+        yield (
+            f"leaf areas: footprints {which} do not show narrower gaps between leaves: where crowns are no wider, leaf "
+            "areas are too small by more than their errors"
+        )
 
 
 def _doubt_returns(shown: np.ndarray, found: int, split: bool) -> Iterator[str]:
