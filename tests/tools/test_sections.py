@@ -102,7 +102,8 @@ def test_profiles_count_sum_and_average(cloud, voxels):
 
 def build_cube(path, lines):
     write_cube(path, lines, {}, None, overwrite=False)
-    return np.load(path)
+    with np.load(path) as file:
+        return dict(file)
 
 
 def test_the_cube_has_every_sample_on_one_axis_of_time(riegl, tmp_path):
