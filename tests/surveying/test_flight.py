@@ -11,7 +11,7 @@ from strips import cut_strip
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
-from wavebatch.surveying.flight import hold_strip, read_samples, survey_flight
+from wavebatch.surveying.flight import compare_flight, read_samples, survey_flight
 from wavebatch.surveying.look import read_flight, surveys_agree
 from wavebatch.surveying.systems.survey_result import SavedSurvey, format_survey, parse_survey
 from wavebatch.tools.simulate import PulseModel, find_pulse, simulate_strip
@@ -74,10 +74,10 @@ def test_the_order_of_the_strips_does_not_matter(strips, flight):
     ],
 )
 def test_a_strip_of_another_sensor_does_not_belong_to_them(strips, flight, name, words):
-    """Held against the flight as it is kept in a file, as a strip that comes later is; the pulse is named first."""
+    """Compared with the flight as it is kept in a file, as a strip that comes later is; the pulse is named first."""
     kept = parse_survey(format_survey(flight.saved), "x")
     with StripReader(strips[name]) as reader, reader.scan() as scan:
-        assert words in hold_strip(reader, scan, kept)
+        assert words in compare_flight(reader, scan, kept)
 
 
 def test_a_stranger_does_not_give_a_descriptor_its_meaning(strips):
@@ -108,7 +108,7 @@ def test_a_later_strip_of_the_sensor_belongs_to_them(strips, flight, name):
     kept = replace(parse_survey(format_survey(flight.saved), "x"), fingerprint={})
     assert read_flight(kept.survey) == read_flight(flight.saved.survey)
     with StripReader(strips[name]) as reader, reader.scan() as scan:
-        assert hold_strip(reader, scan, kept) == ""
+        assert compare_flight(reader, scan, kept) == ""
 
 
 def test_only_strips_whose_echoes_were_compared_are_not_compared_again(strips, flight):
@@ -119,9 +119,9 @@ def test_only_strips_whose_echoes_were_compared_are_not_compared_again(strips, f
     wider = replace(kept.survey.figures, look=replace(kept.survey.figures.look, width=9.0))
     wrong = replace(kept, survey=replace(kept.survey, figures=wider))
     with StripReader(strips["flat"]) as reader, reader.scan() as scan:
-        assert hold_strip(reader, scan, wrong) == ""
+        assert compare_flight(reader, scan, wrong) == ""
         for others in ({}, {"strips": "none"}, {"strips": [{**strip, "compared": False} for strip in surveyed]}):
-            assert "those of the flight 9.00 ns" in hold_strip(reader, scan, replace(wrong, fingerprint=others))
+            assert "those of the flight 9.00 ns" in compare_flight(reader, scan, replace(wrong, fingerprint=others))
 
 
 @pytest.mark.parametrize("waveforms", [30, 900])
@@ -152,7 +152,7 @@ def test_a_strip_that_cannot_be_read_is_left_out(strips, tmp_path):
 def test_a_survey_of_one_strip_is_none_of_a_flight(strips):
     with StripReader(strips["flat"]) as reader, reader.scan() as scan:
         survey = survey_blocks(reader.sample_blocks(scan, 300))
-        refuses(ConfigError, "holds no survey of a flight", hold_strip, reader, scan, SavedSurvey(survey))
+        refuses(ConfigError, "holds no survey of a flight", compare_flight, reader, scan, SavedSurvey(survey))
 
 
 @pytest.mark.slow

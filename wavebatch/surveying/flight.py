@@ -1,7 +1,7 @@
 """One survey for all strips of a flight, and whether a strip belongs to it.
 
 `wavebatch survey STRIPS...` and `run --survey flight` call `survey_flight`; `prepare` compares every strip with the
-result (`hold_strip`). Before you change it: nothing may depend on the order in which the strips are given.
+result (`compare_flight`). Before you change it: nothing may depend on the order in which the strips are given.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class StripSample:
 
 
 @frozen
-class Held:
+class SurveyedStrip:
     """A strip compared with a flight."""
 
     path: Path
@@ -116,10 +116,10 @@ class Flight:
     """The survey of a flight and its strips, by content."""
 
     saved: SavedSurvey
-    strips: tuple[Held, ...]
+    strips: tuple[SurveyedStrip, ...]
 
     @property
-    def misfits(self) -> list[Held]:
+    def misfits(self) -> list[SurveyedStrip]:
         """Return the strips that do not belong to it."""
         return [strip for strip in self.strips if not strip.fits]
 
@@ -229,8 +229,8 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
         survey = survey_blocks(blocks)
         survey = replace(survey, decisions=decide(survey))
         whole = look_at(blocks, survey.system)
-        hold = functools.partial(_hold, system=survey.system, whole=whole, kinds=kinds)
-        judged = list(spread(hold, [(sample, seen.get(sample.path)) for sample in samples]))
+        compare = functools.partial(_compare, system=survey.system, whole=whole, kinds=kinds)
+        judged = list(spread(compare, [(sample, seen.get(sample.path)) for sample in samples]))
         fitting = [sample for sample, strip in zip(samples, judged, strict=True) if strip.fits]
         if not fitting or fitting == group:
             break
@@ -248,7 +248,7 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(judged))
 
 
-def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str:
+def compare_flight(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str:
     """Return why a strip does not belong to a surveyed flight; empty where it does, or where it has no waveforms.
 
     A strip that was compared by so many waveforms when the flight was surveyed is not read again.
@@ -276,12 +276,12 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str
         return ""
     number = min(COMPARED, reader.sample_size(scan))
     sample = StripSample(reader.facts.path, fingerprint, tuple(reader.sample_blocks(scan, number)))
-    return _hold((sample, None), flight.survey.system, whole, kinds).reason if sample.blocks else ""
+    return _compare((sample, None), flight.survey.system, whole, kinds).reason if sample.blocks else ""
 
 
-def _hold(
+def _compare(
     strip: tuple[StripSample, Glance | None], system: SystemPulse, whole: Look | None, kinds: Mapping[int, Kind]
-) -> Held:
+) -> SurveyedStrip:
     """A strip compared with what the flight records; with a glance at it, if there was one."""
     sample, seen = strip
     kind = _compare_kinds(sample.blocks, kinds)
@@ -290,8 +290,8 @@ def _hold(
     pulse = ""
     if look is not None and whole is not None:
         pulse = compare_echoes(look, whole) if kind else compare_looks(look, whole, system)
-    reason = "; ".join(filter(None, (pulse, kind)))
-    return Held(sample.path, sample.fingerprint, sample.waveforms, None if kind else look, reason, sample.facts)
+    reason, look = "; ".join(filter(None, (pulse, kind))), None if kind else look
+    return SurveyedStrip(sample.path, sample.fingerprint, sample.waveforms, look, reason, sample.facts)
 
 
 def _compare_kinds(blocks: Iterable[WaveformBlock], kinds: Mapping[int, Kind]) -> str:

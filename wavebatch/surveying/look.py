@@ -327,7 +327,7 @@ that an echo lies on one sample, or is longer than its waveforms: a damaged desc
 
 
 def with_look(survey: Survey, blocks: Iterable[WaveformBlock]) -> Survey:
-    """Return a survey with the figures by which `check_saved` and `hold_strip` know other strips of the sensor.
+    """Return a survey with the figures by which `check_saved` and `compare_flight` know other strips of the sensor.
 
     Parameters
     ----------

@@ -111,9 +111,9 @@ def prepare(
     """
     stranger = forced = ""  # why it does not belong to its flight, and what contradicts a saved survey
     if request.system is not None and request.flight:
-        from wavebatch.surveying.flight import hold_strip  # and with it the survey
+        from wavebatch.surveying.flight import compare_flight  # and with it the survey
 
-        stranger = hold_strip(reader, scan, request.system)
+        stranger = compare_flight(reader, scan, request.system)
     elif request.system is not None:
         forced = check_saved(reader, scan, request.system.survey, force=request.force)
     used = replace(request, system=None) if stranger else request
