@@ -329,43 +329,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...]
     lines = [*prepared.scan.notes, *name_gains(prepared.facts, prepared.scan)]
     lines += filter(None, [prepared.sensor.doubt()])
     lines += prepared.job.calibration.notes if prepared.job.calibration else ()
-    facts, no_data = dict(prepared.sensor.facts), report.no_data
-    # Echoes at times for which there is no position of the sensor, while others have one.
-    missing = {column: counts.get(NoData.NO_SENSOR.name, 0) for column, counts in no_data.items()}
-    columns = [name for name, number in sorted(missing.items()) if 0 < number < sum(no_data[name].values())]
-    if columns:
-        worst = max(columns, key=lambda name: missing[name])
-        reason, remedy = "rays from which the sensor's position follows are missing there", "give --trajectory"
-        if prepared.sensor.kind == "trajectory":
-            gaps = facts.get("gaps_s", [])
-            times = [f"{begin:.2f} to {end:.2f} s" for begin, end in gaps[:MOST_GAPS]]
-            times += [f"{len(gaps) - MOST_GAPS} more"] * (len(gaps) > MOST_GAPS)
-            reason, remedy = f"{facts['file']} has no position there", "give a trajectory that covers the strip"
-            if times:
-                reason += f" ({100 * (1 - facts['share_covered']):.2g} % of the strip's time: {', '.join(times)})"
-        number, total = missing[worst], sum(no_data[worst].values())
-        lines.append(f"{', '.join(columns)}: {number} of {total} echoes have none: {reason}; {remedy}")
-    # An aircraft that is too fast: its strip may be in feet without saying so.
-    named = any(unit.horizontal is not None for unit in prepared.facts.units)
-    fast = prepared.sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST
-    if fast and not (named and facts.get("height_m", 0.0) > JETS):
-        lines.append(
-            f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
-            f"{facts['height_m']:.0f} m above the points, whatever a CRS says: are they in feet? Then ranges are "
-            "3.28 times too long: project the strip to metres"
-        )
-    height, sensor = prepared.job.sensor.height, prepared.sensor
-    if height is not None and sensor.height is None:
-        seen = facts.get("height_m")
-        where = f": {seen:.0f} m above the points" if seen else ""
-        lines.append(f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}")
-    unseen = 0.0 if sensor.kind == "trajectory" else facts.get("turned_error_deg", 0.0)
-    second = prepared.second_step
-    if second is not None and "incidence_angle_normals" in second.stage.makes and unseen > UNSEEN_TURN:
-        lines.append(
-            "incidence_angle_normals: this strip does not show well whether its packet vectors are turned against the "
-            f"points: the errors hold {plain(sensor.turned, 1)} degrees of it; --trajectory would show it"
-        )
+    lines += _remark_sensor(prepared, report.no_data)
     system = prepared.system
     errors = {"hidden_light": "amplitudes and energies", "hidden_width": "widths"}
     lacks = [name for name in errors if system.hidden and not getattr(system, name)]
@@ -415,6 +379,47 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...]
         )
     few, missed = _explain_columns(prepared, report)
     return (*lines, *few), missed
+
+
+def _remark_sensor(prepared: Prepared, no_data: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
+    """Say where there is no position of the sensor, and what is odd about it."""
+    sensor, facts = prepared.sensor, dict(prepared.sensor.facts)
+    # Echoes at times for which there is no position of the sensor, while others have one.
+    missing = {column: counts.get(NoData.NO_SENSOR.name, 0) for column, counts in no_data.items()}
+    columns = [name for name, number in sorted(missing.items()) if 0 < number < sum(no_data[name].values())]
+    if columns:
+        worst = max(columns, key=lambda name: missing[name])
+        reason, remedy = "rays from which the sensor's position follows are missing there", "give --trajectory"
+        if sensor.kind == "trajectory":
+            gaps = facts.get("gaps_s", [])
+            times = [f"{begin:.2f} to {end:.2f} s" for begin, end in gaps[:MOST_GAPS]]
+            times += [f"{len(gaps) - MOST_GAPS} more"] * (len(gaps) > MOST_GAPS)
+            reason, remedy = f"{facts['file']} has no position there", "give a trajectory that covers the strip"
+            if times:
+                reason += f" ({100 * (1 - facts['share_covered']):.2g} % of the strip's time: {', '.join(times)})"
+        number, total = missing[worst], sum(no_data[worst].values())
+        yield f"{', '.join(columns)}: {number} of {total} echoes have none: {reason}; {remedy}"
+    # An aircraft that is too fast: its strip may be in feet without saying so.
+    named = any(unit.horizontal is not None for unit in prepared.facts.units)
+    fast = sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST
+    if fast and not (named and facts.get("height_m", 0.0) > JETS):
+        yield (
+            f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
+            f"{facts['height_m']:.0f} m above the points, whatever a CRS says: are they in feet? Then ranges are "
+            "3.28 times too long: project the strip to metres"
+        )
+    height = prepared.job.sensor.height
+    if height is not None and sensor.height is None:
+        seen = facts.get("height_m")
+        where = f": {seen:.0f} m above the points" if seen else ""
+        yield f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}"
+    unseen = 0.0 if sensor.kind == "trajectory" else facts.get("turned_error_deg", 0.0)
+    second = prepared.second_step
+    if second is not None and "incidence_angle_normals" in second.stage.makes and unseen > UNSEEN_TURN:
+        yield (
+            "incidence_angle_normals: this strip does not show well whether its packet vectors are turned against the "
+            f"points: the errors hold {plain(sensor.turned, 1)} degrees of it; --trajectory would show it"
+        )
 
 
 def _explain_columns(prepared: Prepared, report: RunReport) -> tuple[list[str], list[str]]:

@@ -78,11 +78,8 @@ class _Strip:
     figures: dict[str, float]
     sensor: str
     """How it was recorded: only strips of one sensor have the same usual values."""
-
-    @property
-    def mark(self) -> str:
-        """Target of links to the part of the strip."""
-        return f"strip-{self.number}"
+    mark: str
+    """Target of links to the part of the strip."""
 
 
 def write_run_page(target: Path, result: BatchResult, folder: Path, command: str = "") -> None:
@@ -96,7 +93,7 @@ def write_run_page(target: Path, result: BatchResult, folder: Path, command: str
             found, figures = report["strip"]["survey"]["figures"], measure_strip(report)
             sensor = f"{found.get('bits', 0):.0f} bits, {found.get('spacing_ns', 0):g} ns"
         cloud = cloud_path(outcome.job, folder)
-        strips.append(_Strip(outcome, number, cloud, place, report is not None, figures, sensor))
+        strips.append(_Strip(outcome, number, cloud, place, report is not None, figures, sensor, f"strip-{number}"))
     marks = find_outliers([strip.figures for strip in strips], [strip.sensor for strip in strips])
     # Strips to look at come first, in the table and where there are too many to show all.
     order = sorted(strips, key=lambda one: (not (one.outcome.error or one.outcome.report.warnings),
