@@ -283,8 +283,8 @@ def test_geocentric_coordinates_stay_so(tmp_path):
 
 def test_utm_agrees_with_a_published_point():
     # Paris, Eiffel Tower: 48.8583 N, 2.2945 E is 31N 448251.9 m E, 5411943.8 m N (WGS 84, public converters).
-    east, north = project_utm(np.array([2.2945]), np.array([48.8583]), 31, south=False)
-    assert abs(east[0] - 448251.9) < 1 and abs(north[0] - 5411943.8) < 2
+    ((east, north, _),) = project_utm(np.array([[2.2945, 48.8583, 0.0]]), 31, south=False)
+    assert abs(east - 448251.9) < 1 and abs(north - 5411943.8) < 2
 
 
 def test_pulses_without_time_get_one(tmp_path):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -186,36 +186,39 @@ def import_file(
                 writer.write_points(points)
                 progress(len(piece.pulses))
             writer.commit()
-    notes = []
+    counts.notes = (*frame.notes, *_list_notes(header, plan, counts, end))
+    return counts
+
+
+def _list_notes(header: PulseHeader, plan: Plan, counts: ImportSummary, end: int) -> Iterator[str]:
+    """What a user should know of an imported file; end: of the waves that its pulses use [byte]."""
     if end < header.waves_size:  # nothing in a .wvs names its .pls
         used = f"{end} of the {header.waves_size} bytes of {header.waves.name}"
-        notes.append(f"warning: its pulses use {used}, which may be that of another file: then its points are wrong")
+        yield f"warning: its pulses use {used}, which may be that of another file: then its points are wrong"
     if plan.one_time:
-        notes.append("all pulses have the same time; they get times 0.1 ms apart")
+        yield "all pulses have the same time; they get times 0.1 ms apart"
     elif not plan.week and plan.time_offset == header.time_offset:
-        notes.append("times are taken as adjusted standard GPS time: as standard GPS time they are of before 2000")
+        yield "times are taken as adjusted standard GPS time: as standard GPS time they are of before 2000"
     if plan.unknown:
         names = ", ".join(map(str, plan.unknown))
-        notes.append(f"channel {names}: its gain over channel {plan.primary} is unknown; all of its segments are kept")
+        yield f"channel {names}: its gain over channel {plan.primary} is unknown; all of its segments are kept"
     for channel, ratio in plan.ratios.items():
-        notes.append(
+        yield (
             f"channel {channel} is {ratio:.2f} times less sensitive than channel {plan.primary}: its counts are "
             f"multiplied by that, and it stands for {counts.replaced} segments that saturate channel {plan.primary}"
         )
     if counts.without_returns:
-        notes.append(f"{counts.without_returns} pulses have no returning segment, and so no point")
+        yield f"{counts.without_returns} pulses have no returning segment, and so no point"
     if counts.outgoing and counts.outgoing["unknown"]:
-        notes.append(f"{counts.outgoing['unknown']} outgoing pulses are clipped or not seen: their energy is not known")
+        yield f"{counts.outgoing['unknown']} outgoing pulses are clipped or not seen: their energy is not known"
     if counts.outgoing and counts.outgoing["other_kind"]:
-        notes.append(
+        yield (
             f"{counts.outgoing['other_kind']} outgoing pulses are recorded with another channel, bits or spacing than "
             "most: their energy is not known, because counts of two recordings have nothing in common"
         )
     kinds = {s.kind for one in header.descriptors.values() for s in one.samplings}
     if plan.outgoing is None and kinds - {RETURNING}:
-        notes.append("its recordings of outgoing pulses show no pulse, or are clipped")
-    counts.notes = (*frame.notes, *notes)
-    return counts
+        yield "its recordings of outgoing pulses show no pulse, or are clipped"
 
 
 # The first pass: what segments and outgoing pulses there are
@@ -667,13 +670,9 @@ class Frame:
         """Return the piece with its pulses in the coordinates of the strip."""
         if not self.zone:
             return piece
-        target = piece.anchor + 1000 * piece.direction
-        anchor, target = (self._project(one) for one in (piece.anchor, target))
+        ends = piece.anchor, piece.anchor + 1000 * piece.direction
+        anchor, target = (project_utm(one, self.zone, south=self.south) for one in ends)
         return replace(piece, anchor=anchor, direction=(target - anchor) / 1000)
-
-    def _project(self, xyz: np.ndarray) -> np.ndarray:
-        east, north = project_utm(xyz[:, 0], xyz[:, 1], self.zone, south=self.south)
-        return np.stack([east, north, xyz[:, 2]], axis=1)
 
 
 def find_frame(reader: PulseReader) -> Frame:
@@ -689,7 +688,7 @@ def find_frame(reader: PulseReader) -> Frame:
         code = zero + zone + (100 if south else 0)
         note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
         frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))
-        first = frame._project(first)
+        first = project_utm(first, zone, south=south)
     else:
         code = keys.sure_code
         scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
@@ -710,26 +709,28 @@ _AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101
 _SCALE, _EASTING, _NORTHING = 0.9996, 500_000.0, 10_000_000.0
 
 
-def project_utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, *, south: bool) -> tuple[np.ndarray, ...]:
-    """Return easting and northing in a UTM zone.
+def project_utm(places: np.ndarray, zone: int, *, south: bool) -> np.ndarray:
+    """Return places in a UTM zone.
 
     Parameters
     ----------
-    longitude, latitude : float64 (n,), degrees
+    places : float64 (n, 3), degrees and m
+        Longitude, latitude and height.
     zone : int
     south : bool
         With the false northing of the southern hemisphere.
 
     Returns
     -------
-    east, north : float64 (n,), m
+    float64 (n, 3), m
+        Easting, northing and height.
 
     References
     ----------
     Karney (2011), Transverse Mercator with an accuracy of a few nanometers, J. Geodesy 85: Krueger's series, equations
     7 to 11 and 35, to the third order: 0.1 mm within 6 degrees of the central meridian.
     """
-    n = _FLATTENING / (2 - _FLATTENING)
+    (longitude, latitude, height), n = places.T, _FLATTENING / (2 - _FLATTENING)
     eccentricity = np.sqrt(_FLATTENING * (2 - _FLATTENING))
     away = np.radians((longitude - (6 * zone - 183) + 180) % 360 - 180)
     # The poles themselves have no place in the series.
@@ -747,4 +748,4 @@ def project_utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, *, south
         north += factor * np.sin(2 * order * xi) * np.cosh(2 * order * eta)
         east += factor * np.cos(2 * order * xi) * np.sinh(2 * order * eta)
     radius = _SCALE * _AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
-    return _EASTING + radius * east, (_NORTHING if south else 0.0) + radius * north
+    return np.stack([_EASTING + radius * east, (_NORTHING if south else 0.0) + radius * north, height], axis=1)
