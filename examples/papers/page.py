@@ -24,7 +24,7 @@ from table import HEADS
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.tools.sheets.page import check_page, render, section, text, write_page
-from wavebatch.tools.sheets.sheet import Cell, Code, Note, Part, Table
+from wavebatch.tools.sheets.sheet import Cell, Code, Note, SheetPart, Table
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -290,7 +290,7 @@ def count_accepted(tables: Sequence[dict]) -> tuple[int, int]:
     return verdicts.count("ok") + verdicts.count("FAIL"), verdicts.count("ok")
 
 
-def build(number: int | None, pulses: int, seed: int) -> tuple[list[Part | str], bool]:
+def build(number: int | None, pulses: int, seed: int) -> tuple[list[SheetPart | str], bool]:
     """The parts of the page, and whether all went well."""
     drawing = importlib.util.find_spec("matplotlib") is not None
     parts, rows, notes, fine = [], [], read_notes(), True

@@ -29,7 +29,7 @@ from wavebatch.files.toml_file import describe_record
 from wavebatch.tools import return_stats as returns
 from wavebatch.tools.cells import doubt_clouds
 from wavebatch.tools.raster import ForestOptions, GridOptions, write_grid
-from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv, list_facts
+from wavebatch.tools.sheets.sheet import Fact, Note, Sheet, SheetPart, Table, format_csv, list_facts
 
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others were counted."""
@@ -104,7 +104,7 @@ def _sheet(found: returns.ReturnStats) -> Sheet:
     numbers = sorted({*found.by_number, *found.by_count})
     shares = [(k, found.by_number.get(k, 0.0), found.by_count.get(k, 0.0)) for k in numbers]
     apart = [(name, one.pairs, one.mean, one.least) for name, one in found.separations.items()]
-    parts: list[Part] = [Note(found.cloud), Fact("points", found.points)]
+    parts: list[SheetPart] = [Note(found.cloud), Fact("points", found.points)]
     each = f" (by {found.pulses_by}), {found.returns_per_pulse:.3f} returns each" if found.pulses else ""
     parts += [Fact("pulses", f"{found.pulses}{each}"), Table(("k", "return k", "k returns"), shares, ".2%")]
     if found.separations["all"].pairs:

@@ -24,7 +24,7 @@ from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.cells import doubt_clouds
 from wavebatch.tools.pairing import Comparison, compare_clouds, compare_truth
-from wavebatch.tools.sheets.sheet import Fact, Later, Note, Part, Picture, Sheet, Table, format_csv, sum_table
+from wavebatch.tools.sheets.sheet import Fact, Later, Note, Picture, Sheet, SheetPart, Table, format_csv, sum_table
 
 if TYPE_CHECKING:
     from wavebatch.tools.compare_chains import Matchup
@@ -163,7 +163,7 @@ _SPREAD = ("number", "median", "mean", "rms", "nmad")
 """What the tables show of a difference."""
 
 
-def _list_parts(one: Comparison) -> Iterator[Part]:
+def _list_parts(one: Comparison) -> Iterator[SheetPart]:
     """How many echoes both sides have, their differences, and the classes of echoes without a partner."""
     yield Later(partial(_draw, one))
     yield from (Fact("A", one.a), Fact("B", one.b))

@@ -19,7 +19,7 @@ from wavebatch.cli.messages import answer, print_sheet, print_text, printable, t
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.units import count
 from wavebatch.tools.file_facts import describe_file
-from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet
+from wavebatch.tools.sheets.sheet import Fact, Note, Sheet, SheetPart
 
 if TYPE_CHECKING:
     from wavebatch.stages.chain import Parameter, Stage
@@ -125,7 +125,7 @@ def check(files: tuple[Path, ...], direction: str, headerless: bool, **options: 
     sys.exit(0 if clean else EXIT_PROBLEMS)
 
 
-def _list_parts(facts: dict[str, Any]) -> Iterator[Part]:
+def _list_parts(facts: dict[str, Any]) -> Iterator[SheetPart]:
     """Header, points, packets and records of a file."""
     kind = "LAZ" if facts["compressed"] else "LAS"
     yield Fact("file", f"{facts['file']} ({facts['bytes']} bytes)")

@@ -29,7 +29,7 @@ from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.files.text_file import find_files
 
 if TYPE_CHECKING:
-    from wavebatch.tools.sheets.sheet import Part
+    from wavebatch.tools.sheets.sheet import SheetPart
 
 _Options = TypeVar("_Options")
 
@@ -257,7 +257,7 @@ def check_html(target: Path | None, *, will_exist: bool = False) -> None:
         check_page(target)
 
 
-def write_html(target: Path | None, of: str, parts: Iterable[Part]) -> None:
+def write_html(target: Path | None, of: str, parts: Iterable[SheetPart]) -> None:
     """Write the page of --html and say so; does nothing without it. of: what its title names beside the command."""
     if target is not None:
         from wavebatch.tools.sheets.page import write_page

@@ -60,7 +60,7 @@ from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.look import pool_blocks
 from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench import accuracy
-from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table
+from wavebatch.tools.sheets.sheet import Cell, Later, Note, Picture, Sheet, SheetPart, Table
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn
 
@@ -520,7 +520,7 @@ def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Shee
         f"kappa {_span(survey['kappa'])}, "
         f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}"
     )
-    parts: list[Part] = [Note(f"== {section['scene']}: {section['meaning']}"), Note(found)]
+    parts: list[SheetPart] = [Note(f"== {section['scene']}: {section['meaning']}"), Note(found)]
     head = ("median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front")
     lines = []
     for row in rows:

@@ -21,7 +21,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError, StageError, advise_install
 from wavebatch.files.disk.publish import Draft, refuse_input, reporting
 from wavebatch.files.figure_file import has_matplotlib
-from wavebatch.tools.sheets.sheet import NO_VALUE, Cell, Code, Fact, Later, Note, Part, Picture, Table
+from wavebatch.tools.sheets.sheet import NO_VALUE, Cell, Code, Fact, Later, Note, Picture, SheetPart, Table
 
 SIGN = '<!doctype html>\n<html lang="en">\n<!-- wavebatch report -->'
 """Start of every page: by it `check_page` knows a page of ours, which may be replaced."""
@@ -50,7 +50,9 @@ def check_page(target: Path) -> None:
         raise ConfigError(f"--html: {target} exists and is no report of wavebatch; choose another name")
 
 
-def write_page(target: Path, title: str, parts: Iterable[Part | str], links: Iterable[tuple[str, str]] = ()) -> None:
+def write_page(
+    target: Path, title: str, parts: Iterable[SheetPart | str], links: Iterable[tuple[str, str]] = ()
+) -> None:
     """Write a page of these parts under a title; an older report of that name is replaced.
 
     A string among the parts is HTML already. links: mark and name of parts, above them.
@@ -109,12 +111,12 @@ def section(title: str, *parts: str, level: int = 2, mark: str = "") -> str:
     return f"<section{place}>\n<h{level}>{text(title)}</h{level}>\n" + "\n".join(filter(None, parts)) + "\n</section>"
 
 
-def render(part: Part, level: int = 2) -> str:
+def render(part: SheetPart, level: int = 2) -> str:
     """A part as HTML; level: of its heading."""
     return "\n".join(_render([part], level))
 
 
-def _render(parts: Iterable[Part | str], level: int) -> Iterator[str]:
+def _render(parts: Iterable[SheetPart | str], level: int) -> Iterator[str]:
     """Facts, notes of a kind and pictures that follow each other are drawn together; text is HTML already."""
     for (kind, word), some in groupby(parts, lambda part: (type(part), getattr(part, "kind", ""))):
         if kind is str:

@@ -28,7 +28,7 @@ from wavebatch.files.toml_file import format_toml
 from wavebatch.surveying.systems.survey_result import SYSTEM_SCHEMA, parse_survey
 from wavebatch.tools.plots.charts import figures_of, picture_cloud
 from wavebatch.tools.sheets.page import write_page
-from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Sheet, Table, sum_table
+from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Sheet, SheetPart, Table, sum_table
 from wavebatch.tools.sheets.survey import survey_sheet
 
 PICTURED = ("amplitude", "echo_width", "range_err", "range", "reflectance", "cross_section", "incidence_angle")
@@ -156,11 +156,11 @@ def find_outliers(strips: Sequence[Mapping[str, float]], sensors: Sequence[str])
 def _list_parts(
     result: BatchResult, strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: Sequence[_Strip],
     command: str,
-) -> Iterator[Part]:  # fmt: skip
+) -> Iterator[SheetPart]:  # fmt: skip
     whole = result.report.to_json()
     counts = whole["counts"]
     states = [outcome.status for outcome in result.outcomes]
-    summary: list[Part] = [
+    summary: list[SheetPart] = [
         Fact("strips written", f"{len(states) - result.failed} of {len(states)}"),
         Fact("with warnings", sum(bool(outcome.report.warnings) for outcome in result.outcomes)),
         *(Fact(name.replace("_", " "), counts[name]) for name in ("points_in", "waveforms", "echoes", "added_echoes")),
@@ -199,7 +199,7 @@ def _list_parts(
     yield Sheet("Run", [*facts, *([Code(command)] if command else [])], "run")
 
 
-def _list_index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int]) -> Iterator[Part]:
+def _list_index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int]) -> Iterator[SheetPart]:
     """A row per strip, with what is unusual of it."""
     few = len(strips) < FEWEST
     yield Note(
@@ -232,7 +232,7 @@ def _list_index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown
     yield Table((*heads, *names), rows, forms, sortable=True, filtered=True)
 
 
-def _list_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> Iterator[Part]:
+def _list_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> Iterator[SheetPart]:
     """The parts of a strip; pictures that cannot be made say why."""
     found, choice = report["strip"], report["choice"]
     survey = {"waveforms": found["survey"]["waveforms"], "figures": found["survey"]["figures"]}

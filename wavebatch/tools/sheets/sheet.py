@@ -88,7 +88,7 @@ class Picture(NamedTuple):
 class Later(NamedTuple):
     """Parts that only a page has, made when it is written; what cannot be read for them becomes a note."""
 
-    draw: Callable[[], Iterable[Part]]
+    draw: Callable[[], Iterable[SheetPart]]
     what: str = "pictures"
 
 
@@ -96,12 +96,12 @@ class Sheet(NamedTuple):
     """Parts under a title."""
 
     title: str
-    parts: Iterable[Part]
+    parts: Iterable[SheetPart]
     mark: str = ""
     """Target of links on a page."""
 
 
-Part = Fact | Note | Table | Code | Picture | Later | Sheet
+SheetPart = Fact | Note | Table | Code | Picture | Later | Sheet
 
 
 def list_lines(sheet: Sheet) -> Iterator[str]:

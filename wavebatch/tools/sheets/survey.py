@@ -29,7 +29,7 @@ from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.surveying.flat_ground import REFERENCE_ERROR
 from wavebatch.surveying.systems.survey_result import Survey, name_model
 from wavebatch.tools.sheets import sheet as sheets
-from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Picture, Sheet, Table, list_facts
+from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Picture, Sheet, SheetPart, Table, list_facts
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
@@ -61,7 +61,7 @@ def list_doubts(document: Mapping[str, Any]) -> list[Note]:
     return [Note(words, "warning") for words in (*strips, *(one["text"] for one in document["warnings"]))]
 
 
-def _list_survey(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
+def _list_survey(survey: Survey, document: Mapping[str, Any]) -> Iterator[SheetPart]:
     """What was surveyed, noise, pulse, and what the waveforms hold; figures that an old file lacks are left out."""
     system, figures = survey.system, survey.figures
     if "points" in document:
@@ -158,7 +158,7 @@ def _draw_survey(survey: Survey) -> Iterator[Picture]:
 
 def survey_page(
     survey: Survey, document: Mapping[str, Any], strips: Sequence[Path], **reading: Any
-) -> Iterator[Part]:
+) -> Iterator[SheetPart]:
     """Yield the parts of the page of a survey.
 
     document: as `survey --json` prints it. strips: those that were surveyed. reading: direction and headerless.
@@ -196,7 +196,7 @@ def calibration_sheet(flight: FlightCalibration) -> Sheet:
     return Sheet("Calibration", [*_list_calibration(flight), drawn])
 
 
-def calibration_page(flight: FlightCalibration) -> list[Part]:
+def calibration_page(flight: FlightCalibration) -> list[SheetPart]:
     """Return the parts of the page of a calibration of one strip or of several."""
     from wavebatch.surveying.calibrating.calibration_files import format_calibration
 
@@ -206,7 +206,7 @@ def calibration_page(flight: FlightCalibration) -> list[Part]:
     return [*(Note(words, "warning") for words in found.notes), *calibration_sheet(flight).parts, provenance]
 
 
-def _list_calibration(flight: FlightCalibration) -> Iterator[Part]:
+def _list_calibration(flight: FlightCalibration) -> Iterator[SheetPart]:
     """Constant, air, beam and swath; tables of targets, channels, strips and overlaps."""
     found = flight.calibration
     constant = format_relative(found.constant, found.relative_error)
