@@ -188,6 +188,14 @@ def test_levels_are_those_of_single_waveforms(rng, recovery):
         assert lowest[w] == sorted(signal[:, w])[len(signal) // 10]
 
 
+def test_levels_without_noise_give_no_warning():
+    """NumPy printed that it divides by zero; the covariance was the same."""
+    signal, quiet = np.zeros((40, 5000), np.float32), np.ones((40, 5000), bool)
+    signal[22:], quiet[20:22] = 3, False
+    found = noise_kernels.measure_covariance(signal, quiet, lags=8)
+    assert np.isfinite(found).all() and found[1] == found[0] > 0
+
+
 def test_correlations_are_those_of_pairs(rng):
     white = rng.standard_normal((70, 50))
     signal = (12 + white[3:] + 0.6 * white[2:-1] - 0.2 * white[:-3]).astype(np.float32)

@@ -10,6 +10,8 @@ from commands import refuses
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.files.cloud.column_names import Naming, WrittenColumn
+from wavebatch.files.las.header import ExtraRecord
 from wavebatch.stages import chain as chain_module
 from wavebatch.stages.chain import STAGES, Chain, Range, Step, list_profiles, load_profile, stage
 
@@ -288,7 +290,8 @@ def test_parameters_reach_the_stage_and_the_effective_ones_name_all():
 
 
 @pytest.mark.parametrize(
-    "failure", [ValueError("bad"), IndexError("out"), ZeroDivisionError("zero"), np.linalg.LinAlgError("singular")]
+    "failure",
+    [ValueError("bad"), IndexError("out"), ZeroDivisionError("zero"), np.linalg.LinAlgError("singular"), SystemExit(7)],
 )
 def test_a_stage_that_fails_names_itself_and_the_waveforms_in_one_line(failure):
     @stage("decompose")
@@ -305,6 +308,37 @@ def test_a_stage_that_fails_names_itself_and_the_waveforms_in_one_line(failure):
     assert str(failure) in message
     assert "\n" not in message
     assert caught.value.__cause__ is failure
+
+
+@pytest.mark.parametrize(
+    ("give", "said"),
+    [(lambda echoes, name: None, "returned NoneType in place of EchoTable"), (lambda echoes, name: echoes, "no column"),
+     (lambda echoes, name: echoes.with_attributes(**{name: np.zeros((len(echoes), 2))}), "no column"),
+     (lambda echoes, name: echoes.with_attributes(**{name: np.full(len(echoes), "x")}), "no column")],
+)  # fmt: skip
+def test_a_stage_that_breaks_its_promise_is_named(give, said):
+    """The column was no-data, or its first part, for every echo, in silence."""
+
+    @stage("attribute", makes=(Column("promised", "f4", "-", "nothing"),))
+    def broken(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+        """Not what it says."""
+        return give(echoes, "promised")
+
+    with pytest.raises(StageError, match=f"^stage attribute.broken .*{said}"):
+        Chain((*steps(*BASE), Step(chain_module.STAGES["attribute.broken"]))).run(block(), SYSTEM)
+
+
+def test_integers_of_a_column_are_kept_within_its_type_and_have_a_no_data_that_fits():
+    """9999 in a byte was 15, and the no-data of -9999 was 241, which no record declares."""
+    with pytest.raises(StageError, match=r"attribute.bytes: small \(u1\) cannot hold its no_data -9999"):
+
+        @stage("attribute", makes=(Column("small", "u1", "-", "a byte"),))
+        def bytes(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+            """Never run."""
+
+    record = ExtraRecord.build("small", "u1", "a byte", no_data=255)
+    values = WrittenColumn("small", record, Naming("small")).encode(np.array([0, 9999, -7, 255]))
+    assert values.dtype == np.uint8 and values.tolist() == [0, 254, 0, 254]
 
 
 def test_time_is_kept_per_stage_and_added_up():

@@ -432,6 +432,9 @@ def _columns(
 def spread(name: str, values: np.ndarray, echo: np.ndarray) -> np.ndarray:
     """Return a column (m,) of rows from its values (k,) by echo; no-data where `echo` is -1."""
     # NaN becomes no-data when it is written. Integers have no NaN: they need the declared value itself.
+    values = np.asarray(values)
+    if values.dtype.kind != "f":
+        values = values.astype(np.result_type(values, COLUMNS[name].dtype), copy=False)  # of a plug-in: any integers
     empty = np.nan if values.dtype.kind == "f" else COLUMNS[name].no_data or 0
     return np.append(values, values.dtype.type(empty))[echo]
 

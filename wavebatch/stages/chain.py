@@ -167,6 +167,10 @@ def stage(
         new = {column.name: column for column in makes if isinstance(column, Column)}
         if taken := new.keys() & COLUMNS.keys():
             raise StageError(f"stage {name} declares column {min(taken)}, which there is already")
+        for one in new.values():
+            limits = np.iinfo(one.dtype) if np.dtype(one.dtype).kind in "iu" else None
+            if limits and one.no_data is not None and not limits.min <= one.no_data <= limits.max:
+                raise StageError(f"stage {name}: {one.name} ({one.dtype}) cannot hold its no_data {one.no_data:g}")
         COLUMNS.update(new)
         names = tuple(column.name if isinstance(column, Column) else column for column in makes)
         STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, shape, check, searches)
@@ -457,11 +461,18 @@ class Chain:
             result = step.stage.function(*(data[name] for name in KINDS[step.stage.kind][0]), **step.parameters)
         except ConfigError as error:
             raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {error}") from error
-        except (ArithmeticError, IndexError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+        except (ArithmeticError, AttributeError, LookupError, SystemExit, TypeError, ValueError) as error:
             raise StageError(
                 f"stage {step.stage.name} failed on the {len(block)} waveforms from point {block.first}: "
                 f"{type(error).__name__}: {error}; this is a bug, please report it with the strip"
             ) from error
+        kind = KINDS[step.stage.kind][1]
+        if not isinstance(result, kind):
+            raise StageError(f"stage {step.stage.name} returned {type(result).__name__} in place of {kind.__name__}")
+        for column in step.stage.makes:
+            values = np.asarray(getattr(result, "attributes", {}).get(column))
+            if values.ndim != 1 or values.dtype.kind not in "biuf":
+                raise StageError(f"stage {step.stage.name} gave no column {column} with a number for each echo")
         if timing is not None:
             timing[step.stage.name] = timing.get(step.stage.name, Seconds()) + (Seconds.now() - start)
         return result

@@ -136,8 +136,8 @@ class WrittenColumn:
         Scaled values outside the stored type become its nearest value that is not no-data.
         """
         dtype, no_data = self.record.dtype, self.record.no_data
-        if dtype.kind in "ui" and np.asarray(values).dtype.kind in "ui":
-            return np.asarray(values).astype(dtype, copy=False)
+        if dtype.kind in "ui" and values.dtype == dtype:
+            return values
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             values = np.asarray(values, np.float64 if self.naming.decibel or self.naming.scale else None)
             if self.naming.decibel:

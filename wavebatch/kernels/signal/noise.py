@@ -452,7 +452,7 @@ def measure_covariance(
     # Runs that reach each lag: differences of one run are no more than one.
     runs = np.maximum(-np.diff([*pairs, found[len(half)][0] if len(found) > len(half) else 0.0]), 1.0)
     rises = half[-1] - half[max(far - 1, 0)] > CHANCE * half[-1] * np.sqrt(2 / runs[-1])
-    if rises and len(half) >= RISE and pairs[-1] >= LEAST_PAIRS:
+    if rises and len(half) >= RISE and pairs[-1] >= LEAST_PAIRS and min(half) > 0:  # 0: there is no noise at all
         variance = float(np.var(signal[quiet], dtype=np.float64))
         slow = _extend(np.array(half), runs, max(lags, len(half)), variance)
         if slow[0] > (1 + SETTLED) * sill:
