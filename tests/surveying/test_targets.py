@@ -255,3 +255,19 @@ def test_a_middle_without_an_echo_is_said_with_its_size(hole, rng):
     target = Target("t", 0.3, np.array([(-3.0, -3.0), (3.0, -3.0), (3.0, 3.0), (-3.0, 3.0)]))
     result, *_ = targets_module.measure_target(target, rows, 0.1, 0.03)
     assert result.hidden_m == (pytest.approx(2 * hole, abs=0.3) if hole > 1.0 else None)
+
+
+@pytest.mark.parametrize(("number", "hole", "least", "most"), [(30, 0.0, 0, 2), (60, 0.0, 0, 2), (60, 1.0, 50, 50)])
+def test_a_middle_without_an_echo_by_chance_is_not_said(number, hole, least, most):
+    """Of sound targets with 30 echoes one in seven was named."""
+    said = 0
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        rows = np.zeros(4 * number, CLEAN_ECHO)
+        rows["xyz"][:, :2] = rng.uniform(-3, 3, (len(rows), 2))
+        rows = rows[np.abs(rows["xyz"]).max(axis=1) > hole][:number]
+        rows["ray"], rows["distance"] = (0.0, 0.0, -1.0), 700.0
+        rows["light"], rows["light_err"] = 1e4 * (1 + 0.02 * rng.standard_normal(number)), 1.0
+        target = Target("t", 0.3, np.array([(-3.0, -3.0), (3.0, -3.0), (3.0, 3.0), (-3.0, 3.0)]))
+        said += targets_module.measure_target(target, rows, 0.1, 0.03)[0].hidden_m is not None
+    assert least <= said <= most

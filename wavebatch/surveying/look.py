@@ -422,21 +422,23 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     look = look_at(blocks, survey.system)
     if look is None:
         return "", False
+    # That of a survey with figures is of its strip, unless somebody has edited it.
+    noise, seen, other = survey.system.noise, look.level.std, ""
+    noises = [noise.std, *(value for value in noise.by_kind.values() if value > 0 and figures.look is None)]
+    if not min(noises) / LARGEST_NOISE < seen < max(noises) * LARGEST_NOISE:
+        other = f"its noise is {seen:.2f} DN, that of the survey {noise.std:.2f}"
     if figures.look is None:
-        reason = _compare_system(look, survey)
+        reason = other or _compare_system(look, survey)
         return reason, bool(reason)
     look = replace(look, level=replace(look.level, mean=whole.level.mean))
     surely = compare_looks(look, whole, survey.system, wider=LARGEST_WIDTH - 1)
-    reason = surely or compare_looks(look, whole, survey.system)
+    reason = surely or other or compare_looks(look, whole, survey.system)
     return reason.replace("the flight", "the survey"), bool(surely)
 
 
 def _compare_system(look: Look, survey: Survey) -> str:
-    """Why echoes and noise are not of the saved pulse, with wide limits."""
+    """Why echoes are not of the saved pulse, with wide limits."""
     system = survey.system
-    noises = [system.noise.std, *(value for value in system.noise.by_kind.values() if value > 0)]
-    if not min(noises) / LARGEST_NOISE < look.level.std < max(noises) * LARGEST_NOISE:
-        return f"its noise is {look.level.std:.2f} DN, that of the survey {system.noise.std:.2f}"
     if not look.width:
         return ""
     ratio = look.width / system.sigma_ref

@@ -172,9 +172,9 @@ few in the middle differ from the rest by the third, which no stain does: the ta
 how many sizes of it are tried."""
 
 
-MOST_HOLE = 0.25
-"""Part of an outline, as a length, without an echo in its middle from which a target of that size is said not to show:
-thirty echoes that lie by chance leave as much in one of seven outlines, twenty in one of four."""
+MOST_HOLE, BY_CHANCE = 0.25, 0.02
+"""Part of an outline, as a length, without an echo in its middle from which a target of that size is said not to show;
+and chance that echoes at random places leave it: thirty of them leave a quarter in one of seven outlines."""
 
 LEAST_NEGATIVE, MOST_REFLECTANCE, BRIGHT = 0.01, 1.5, 0.1
 """Share of negative values from which a column of reflectances is in dB; most that surfaces send back along the light:
@@ -268,8 +268,10 @@ def measure_target(
     low, high = target.corners.min(axis=0), target.corners.max(axis=0)
     places = np.zeros((1024, 3))
     places[:, :2] = low + (high - low) * (np.indices((32, 32)).reshape(2, -1).T + 0.5) / 32
-    deepest = float(target.depth(places[target.contains(places)]).max(initial=0.0))
-    hole = deepest - float(depth[used].max())
+    depths = target.depth(places[target.contains(places)])
+    deepest, reached = float(depths.max(initial=0.0)), float(depth[used].max())
+    hole, nearer = deepest - reached, float(np.mean(depths[depths >= inset] <= reached)) if deepest >= inset else 1.0
+    hidden = hole > MOST_HOLE * deepest and nearer ** int(used.sum()) < BY_CHANCE
     result = replace(
         summarise(blank, constant),
         incidence_deg=float(np.degrees(np.median(angle[used]))),
@@ -278,7 +280,7 @@ def measure_target(
         edge=edge,
         strange=strange,
         apart=_compare_parts(relative, rows["xyz"][used]),
-        hidden_m=round(2.0 * hole, 2) if hole > MOST_HOLE * deepest else None,
+        hidden_m=round(2.0 * hole, 2) if hidden else None,
     )
     inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(result.echoes - 1)
     hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
