@@ -58,15 +58,12 @@ LIKE_FEET = 0.35
 HIDDEN = 0.05
 """Error from which it is said that another gain or energy would not show, or that light is uneven on common ground."""
 
-FROM_START = 2.0 / 3.0**0.5
-"""Root mean square over a strip of light that changes evenly from its start, over the change from half to half."""
-
 SIDES = ("from half to half of the swath", "between its middle and its edges")
 """Of `Setting.sides`."""
 
 ANYWHERE = (2.0 / 3.0) ** 0.5
-"""Root mean square of what even growth across a swath changes between two places anywhere in it, a target's and an
-echo's, over the growth from half to half."""
+"""Root mean square of what even growth along a strip, or across a swath, changes between two places anywhere in it, a
+target's and an echo's, over the growth from half to half."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -172,20 +169,22 @@ def compare_setting(
         louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
         ground = _compare_places(calibration, found, row, louder, usual)
         shown &= ground is not None
+        scene = found.scenes.get((row.digitizer, row.scanner)) or ()
+        alike, change = ("ground in common is", ground[0]) if ground else ("scenes are", settings.NO_CHANGE)
+        chance, shows = calibration.change_chance, ground is not None or 0 < len(row.scene) == len(scene)
+        if shows and ground is None:
+            change = settings.compare_scenes(scene, row.scene, louder, chance=chance, usual=usual)
         if ground is None:
             compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
+        if ground is None and (not shows or change.chance > settings.LIKELY):
             # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
             light = found.brightest.get((row.digitizer, row.scanner))
             surfaces = "other surfaces"
             if light and row.brightest and abs(math.log(light / row.brightest * FOOT**2)) < LIKE_FEET:
                 surfaces += ", or coordinates in feet (which make it 10.8 times as bright)"
             compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or {surfaces}: light {which} is")
-        scene = found.scenes.get((row.digitizer, row.scanner))
-        if ground is None and (not scene or len(row.scene) != len(scene)):
+        if not shows:
             continue
-        alike, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
-        chance = calibration.change_chance
-        change = change or settings.compare_scenes(scene or (), row.scene, louder, chance=chance, usual=usual)
         # What common ground shows is in the error, whatever changed it, with half of what it is uncertain: 68 % of the
         # changes that may have made it are smaller.
         seen = bool(ground or change.chance > settings.LIKELY)
@@ -250,7 +249,7 @@ def judge_fading(
     # One laser that fades is enough.
     seen = max((ground[1] for ground in compared if ground and ground[1]), key=lambda one: one[1:3], default=fades)
     if fades.is_uneven:
-        growth = math.expm1(fades.error)
+        growth = math.expm1(max(fades.error, abs(fades.shift)))
         return growth, [
             f"calibration: one of the flight lines in this file is {100 * growth:.0f} % brighter or darker than the "
             "others, over ground that they share: another energy or gain, or wet ground? The error of the constant "
@@ -266,13 +265,13 @@ def judge_fading(
             "by it; calibrate shorter strips"
         ], []
     if fades.chance > settings.LIKELY:
-        growth = math.expm1(FROM_START * abs(fades.shift))
+        growth = math.expm1(ANYWHERE * abs(fades.shift))
         return growth, [
             f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
             "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
             f"{100 * growth:.0f} %; calibrate shorter strips"
         ], []
-    growth = math.expm1(FROM_START * fades.error)
+    growth = math.expm1(ANYWHERE * fades.error)
     if growth < HIDDEN or not other and len(calibration.strips) > 1:
         return 0.0, [], []
     return growth, [], [
