@@ -325,6 +325,8 @@ class EchoTable:
         pairs = [(table, 0) if isinstance(table, EchoTable) else table for table in tables]
         if not pairs:
             return cls.empty()
+        if len(pairs) == 1 and not pairs[0][1]:  # of most units
+            return pairs[0][0]
         names = list(pairs[0][0].attributes)
         if any(set(table.attributes) != set(names) for table, _ in pairs):
             raise StageError("tables with different columns cannot be joined")

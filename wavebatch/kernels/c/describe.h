@@ -468,7 +468,7 @@ INLINE void add_all_pairs(int64_t end, const float *signal, const uint8_t *marks
 /* Pairs of quiet samples `lag` to `last` apart of waveforms in columns, signal (s, n), no number where it is not quiet:
    number and sum of squared differences of all pairs, of those with a sample of mark HIGH, of LOW, and of both: out
    (last - lag + 1, 4, 2), zeros. Without marks (s, n) only the first. */
-EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const uint8_t *marks, int64_t lag, int64_t last, double *out) {
+INLINE int64_t pair_differences_any(int64_t s, int64_t n, const float *signal, const uint8_t *marks, int64_t lag, int64_t last, double *out) {
     for (; lag <= last; lag++, out += 2 * PAIR_KINDS) {
         const int64_t ahead = lag * n, end = (s - lag) * n;
         if (marks) add_all_pairs(end, signal, marks, ahead, out);
@@ -476,3 +476,5 @@ EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const
     }
     return 0;
 }
+OFFER(pair_differences, (int64_t s, int64_t n, const float *signal, const uint8_t *marks, int64_t lag, int64_t last, double *out),
+      (s, n, signal, marks, lag, last, out))

@@ -2,7 +2,7 @@
 
 /* As `find_maxima`: waveforms `from` to n - 1, until the room ends. Times and heights are those of the correlation, widths
    those of the smoothed waveform. What lies inside of gaps is no candidate, whatever the filter shows there. */
-EXPORT int64_t find_correlated(const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found) {
+INLINE int64_t find_correlated_any(const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found) {
     const int64_t s = b->length;
     const double ref = d->width_ref;
     Rows r = {0};
@@ -28,3 +28,5 @@ EXPORT int64_t find_correlated(const Block *b, int64_t n, const Detector *d, int
     *found = total;
     return w;
 }
+OFFER(find_correlated, (const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found),
+      (b, n, d, from, out, found))

@@ -63,9 +63,10 @@ enum { has_eight = 0, has_sixteen = 0 };
 #define AVX2
 #endif
 
-/* Offers a function, NAME_any, compiled for AVX2 too, where one register holds four doubles: the same operations, the same bits. */
+/* Offers a function, NAME_any, compiled for AVX2 too with all that it calls, where one register holds twice as much: the same
+   operations, the same bits. */
 #define OFFER(NAME, PARAMETERS, ARGUMENTS) \
-    AVX2 static int64_t NAME##_avx2 PARAMETERS { return NAME##_any ARGUMENTS; } \
+    AVX2 __attribute__((flatten)) static int64_t NAME##_avx2 PARAMETERS { return NAME##_any ARGUMENTS; } \
     EXPORT int64_t NAME PARAMETERS { return has_eight ? NAME##_avx2 ARGUMENTS : NAME##_any ARGUMENTS; }
 
 static void sum_of_gaussians(const Pulse *shape, const Echo *echo, const lanes *x, int64_t vectors, Basis out) {

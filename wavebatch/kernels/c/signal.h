@@ -246,7 +246,7 @@ static void mark_peaks(int64_t s, const float *restrict y, float least, uint8_t 
 
 /* Local maxima of smoothed waveforms `from` to n - 1 with starts for the fit, until their room ends: 1.1, max-detection.
    Returns the first waveform that is not done, and in `found` the number of maxima; -1 where there is no memory. */
-EXPORT int64_t find_maxima(const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found) {
+INLINE int64_t find_maxima_any(const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found) {
     const int64_t s = b->length;
     const double ref = d->width_ref;
     Rows r = {0};
@@ -288,6 +288,8 @@ EXPORT int64_t find_maxima(const Block *b, int64_t n, const Detector *d, int64_t
     *found = total;
     return w;
 }
+OFFER(find_maxima, (const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found),
+      (b, n, d, from, out, found))
 
 static const double RUN_LEVEL = 2;             /* of a run, in noise of the smoothed signal: echoes on one are one cluster */
 
@@ -343,7 +345,7 @@ static int64_t group_waveform(const Grouping *g, int64_t s, int64_t waveform, in
 
 /* Joins m candidates, sorted by waveform and time, that stand on one run of signal above the noise: 4.2. A window that
    reaches into its neighbour finds false echoes there. Returns the number of clusters; -1 where there is no memory. */
-EXPORT int64_t group_candidates(const Block *b, int64_t m, const int64_t *waveform, const double *time, const Grouping *g, Groups *out) {
+INLINE int64_t group_candidates_any(const Block *b, int64_t m, const int64_t *waveform, const double *time, const Grouping *g, Groups *out) {
     const int64_t s = b->length;
     Rows r = {0};
     int64_t number = 0, *at = NULL, *low = NULL, *high = NULL;
@@ -361,6 +363,8 @@ EXPORT int64_t group_candidates(const Block *b, int64_t m, const int64_t *wavefo
     free(at); free(low); free(high);
     return good ? number : -1;
 }
+OFFER(group_candidates, (const Block *b, int64_t m, const int64_t *waveform, const double *time, const Grouping *g, Groups *out),
+      (b, m, waveform, time, g, out))
 
 static const float FAR_ABOVE = 2.2f;           /* noises, and half of the tails, that a candidate lies above them where it is another echo */
 

@@ -13,7 +13,7 @@ typedef struct {
 static double earliest(const Stacked *s, double sigma) { return fmin(fmax(s->early, 2 * sigma - s->onset), s->last); }
 
 /* Draws components, whose place is a share of the way from the earliest to the end: z and bell (m, n), rest (n); returns its squares. */
-static double draw_stacked(const Stacked *s, const double *p, double *z, double *bell, double *rest) {
+static double draw_stacked(const Stacked *s, const double *p, double *z, double *restrict bell, double *restrict rest) {
     for (int64_t c = 0; c < s->m; c++) {
         const double sigma = p[3 * c + 2], first = earliest(s, sigma), delay = first + p[3 * c + 1] * (s->end - first);
         for (int64_t i = c * s->n; i < (c + 1) * s->n; i++) {
@@ -23,12 +23,11 @@ static double draw_stacked(const Stacked *s, const double *p, double *z, double 
     }
     exponentials(s->m * s->n, bell, bell);
     double cost = 0;
-    for (int64_t i = 0; i < s->n; i++) {
-        double sum = 0;
-        for (int64_t c = 0; c < s->m; c++) sum += p[3 * c] * bell[c * s->n + i];
-        rest[i] = (sum - s->value[i]) * s->weight[i];
-        cost += rest[i] * rest[i];
-    }
+    memset(rest, 0, s->n * sizeof(double));
+    for (int64_t c = 0; c < s->m; c++)
+        for (int64_t i = 0; i < s->n; i++) rest[i] += p[3 * c] * bell[c * s->n + i];
+    for (int64_t i = 0; i < s->n; i++) rest[i] = (rest[i] - s->value[i]) * s->weight[i];
+    for (int64_t i = 0; i < s->n; i++) cost += rest[i] * rest[i];
     return cost;
 }
 

@@ -275,7 +275,9 @@ def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float
     if np.count_nonzero(inner & (signal[1:-1] == signal.min())) > MOST_LEAST * len(values):
         return 1.0
     # Counts are whole: where noise stays on two of them their median is one, and either side would be an echo's.
-    values = values - median(values + (np.arange(len(values)) * DITHER[0] % 1).astype(np.float32)) + np.float32(0.5)
+    dither = np.arange(len(values)) * DITHER[0]
+    dither -= np.floor(dither)  # % takes eight times as long
+    values = values - median(values + dither.astype(np.float32)) + np.float32(0.5)
     above, below = (float(np.sum(np.square(side, dtype=np.float64))) for side in (values.clip(0), values.clip(max=0)))
     return above / max(below, 1e-12)
 
@@ -341,14 +343,12 @@ def find_ends(above: np.ndarray, width: float, reach: int, recovery: int = 0) ->
     smoothed = np.abs(smooth_121(above))
     busy = ~(smoothed <= np.float32(width))
     place = np.arange(s, dtype=np.int32)[:, None]
-    any_busy = busy.any(axis=0)
-    first = np.where(any_busy, np.argmax(busy, axis=0), s + reach)
-    last = np.where(any_busy, s - 1 - np.argmax(busy[::-1], axis=0), -1 - reach)
-    quiet = (place < first - -(-reach // BEFORE_SIGNAL)) | (place > last + reach)
+    first, end = s - (busy * (s - place)).max(axis=0), (busy * (place + 1)).max(axis=0)
+    quiet = (place < first - -(-reach // BEFORE_SIGNAL)) | (place >= end + reach) | (end == 0)
     if recovery > reach:
         strong = smoothed > np.float32(STRONG * width)
-        last = np.where(strong.any(axis=0), s - 1 - np.argmax(strong[::-1], axis=0), -1 - recovery)
-        quiet &= (place < first) | (place > last + recovery)
+        end = (strong * (place + 1)).max(axis=0)
+        quiet &= (place < first) | (place >= end + recovery) | (end == 0)
     return quiet
 
 

@@ -239,11 +239,12 @@ def position(
     # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
     # Between return and echo, vectors that are not as long as light is fast miss by the difference.
-    missed, wrong = np.zeros(len(echoes)), np.maximum(np.abs(speed - HALF_C), np.abs(speed - AIR_SPEED))
+    range_err, wrong = echoes.time_err * speed[waveform], np.maximum(np.abs(speed - HALF_C), np.abs(speed - AIR_SPEED))
     if returns is not None and len(returns) and wrong.max(initial=0.0) > LEAST_WRONG * HALF_C:
         first = np.searchsorted(returns.waveform, waveform).clip(max=len(returns) - 1)
         start = np.where(returns.waveform[first] == waveform, returns.time[first], 0.0)  # without a return: the origin
         missed = np.abs(along - start) * np.where(wrong > LEAST_WRONG * HALF_C, wrong, 0.0)[waveform]
+        range_err = np.hypot(range_err, missed)
     phase, shift = system.radiometry.phase, np.abs(offset) * speed
     # An offset far beyond those of lone echoes is no phase: the return is of two surfaces, or of another one.
     shift = np.where((phase > 0) & (shift > STRANGE_SHIFT * phase), shift, 0.0)
@@ -254,9 +255,7 @@ def position(
         y=xyz[:, 1],
         z=xyz[:, 2],
         point=point,
-        range_err=np.hypot(
-            np.hypot(echoes.time_err * speed[waveform], missed), np.maximum(shared[waveform], bent * speed[waveform])
-        ).astype(np.float32),
+        range_err=np.hypot(range_err, np.maximum(shared[waveform], bent * speed[waveform])).astype(np.float32),
     )
     if returns is None:
         return echoes

@@ -353,7 +353,8 @@ def _leave_out_explained(table: EchoTable, solution: decompose.Solution) -> Echo
     alone = solution.number[table.attributes[CLUSTER]] == 1
     alone &= (table.flags & np.uint16(EchoFlag.SATURATED)) == 0
     explained = alone & (table.attributes[FACTOR] > ROOM) & (table.amplitude < table.amplitude_err)
-    return replace(table, attributes={}).take(~explained)
+    table = replace(table, attributes={})
+    return table.take(~explained) if explained.any() else table
 
 
 def _find_unknown(table: EchoTable, settings: decompose.Settings, noise: np.ndarray) -> np.ndarray:
