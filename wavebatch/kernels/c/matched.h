@@ -28,5 +28,4 @@ INLINE int64_t find_correlated_any(const Block *b, int64_t n, const Detector *d,
     *found = total;
     return w;
 }
-OFFER(find_correlated, (const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found),
-      (b, n, d, from, out, found))
+OFFER(find_correlated, (const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found), (b, n, d, from, out, found))

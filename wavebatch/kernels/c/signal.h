@@ -288,8 +288,7 @@ INLINE int64_t find_maxima_any(const Block *b, int64_t n, const Detector *d, int
     *found = total;
     return w;
 }
-OFFER(find_maxima, (const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found),
-      (b, n, d, from, out, found))
+OFFER(find_maxima, (const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found), (b, n, d, from, out, found))
 
 static const double RUN_LEVEL = 2;             /* of a run, in noise of the smoothed signal: echoes on one are one cluster */
 
@@ -306,8 +305,7 @@ static void find_extents(int64_t s, const float *smoothed, float level, int64_t 
             while (begin > 0 && smoothed[begin - 1] > level) begin--;
             while (end < s && smoothed[end] > level) end++;
         }
-        at[i] = place; low[i] = begin;
-        high[i] = end;
+        at[i] = place; low[i] = begin; high[i] = end;
     }
     for (int64_t i = 0; i < m && tail; i++)
         if (at[i] + tail[i] > high[i]) high[i] = at[i] + tail[i];
@@ -363,8 +361,7 @@ INLINE int64_t group_candidates_any(const Block *b, int64_t m, const int64_t *wa
     free(at); free(low); free(high);
     return good ? number : -1;
 }
-OFFER(group_candidates, (const Block *b, int64_t m, const int64_t *waveform, const double *time, const Grouping *g, Groups *out),
-      (b, m, waveform, time, g, out))
+OFFER(group_candidates, (const Block *b, int64_t m, const int64_t *waveform, const double *time, const Grouping *g, Groups *out), (b, m, waveform, time, g, out))
 
 static const float FAR_ABOVE = 2.2f;           /* noises, and half of the tails, that a candidate lies above them where it is another echo */
 

@@ -249,7 +249,8 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
     spread : float64 (k,)
         Their standard deviation, from the median of their distances from it.
     """
-    classes = min(max(len(distinct(height)) // GROWTH_CLASS, 1), 8)
+    heights = np.append(height[:-1][height[1:] != height[:-1]], height[-1:])  # those of an echo stand together
+    classes = min(max(len(distinct(heights)) // GROWTH_CLASS, 1), 8)
     bins = int(2 * reach / GROWTH_STEP)
     place = np.clip(((lag + reach) / GROWTH_STEP).astype(np.int64), 0, bins - 1)
     place += bins * np.searchsorted(quantiles(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
@@ -286,23 +287,24 @@ def _find_leverage(lag: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.
 
     The three derivatives of a Gaussian, made orthogonal over its samples: h_ij is the sum of their products.
     """
-    row, column = np.nonzero(np.abs(lag) < FITTED)
-    z = lag[row, column].astype(np.float64)
+    near = np.abs(lag) < FITTED
+    at, row = np.flatnonzero(near), np.repeat(np.arange(len(lag)), np.count_nonzero(near, axis=1))
+    z = lag.take(at).astype(np.float64)
     basis: list[np.ndarray] = []
     for power in range(3):
         values = z**power * exp(-0.5 * z * z)
         for one in basis:
             values = values - one * np.bincount(row, one * values)[row]
         basis.append(values / np.sqrt(np.maximum(np.bincount(row, values * values), 1e-9))[row])
-    taken, brought = np.zeros((2, *lag.shape))
-    sums, height = np.zeros((2, len(z))), signal[row, column].astype(np.float64)
+    sums, height = np.zeros((2, len(z))), signal.take(at).astype(np.float64)
     for i, one in enumerate(basis):
         sums[0] += one * one
         for j, other in enumerate(basis[: i + 1]):
             product = one * other
             sums[1] += (1 if i == j else 2) * product * np.bincount(row, product * height)[row]
-    taken[row, column], brought[row, column] = sums
-    return taken, brought
+    taken, brought = np.zeros((2, lag.size))
+    taken[at], brought[at] = sums
+    return taken.reshape(lag.shape), brought.reshape(lag.shape)
 
 
 def _noise_gain(
@@ -315,23 +317,25 @@ def _noise_gain(
     core = np.abs(lag) < GROWTH_REACH
     taken, brought = _find_leverage(lag, model) if fitted else np.zeros((2, *lag.shape))
     core &= taken < MOST_TAKEN
-    taken, brought = taken[core], brought[core]
+    at = np.flatnonzero(core)
+    taken, brought, lag, signal = taken.take(at), brought.take(at), lag.take(at), model.take(at).astype(np.float64)
     # Residuals at `core` (mask) less what all echoes of about one height leave at one lag (k,).
     # That part changes with the height where a receiver compresses, and would look like noise that grows with the
     # signal: one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
-    height = np.broadcast_to(model.max(axis=1)[:, None], lag.shape)[core]
-    values = residual[core].astype(np.float64)
-    common, number, _ = find_common(values, lag[core], height, GROWTH_REACH)
+    height = np.repeat(model.max(axis=1), np.count_nonzero(core, axis=1))
+    values = residual.take(at).astype(np.float64)
+    common, number, _ = find_common(values, lag, height, GROWTH_REACH)
     squared = ((values - common) * np.sqrt(number / np.maximum(number - 1, 1))) ** 2 / (1 - taken)
     # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
-    signal = (model[core].astype(np.float64) * (1 - 2 * taken) + brought) / (1 - taken)
+    signal = (signal * (1 - 2 * taken) + brought) / (1 - taken)
     if len(signal) < ENOUGH_TO_GROW:
         return 0.0
+    order = np.argsort(signal)
+    signal, squared = signal[order], squared[order]
     edges = quantiles(signal, np.linspace(0, 1, 13))
-    place = np.clip(np.searchsorted(edges, signal) - 1, 0, 11)
-    filled = [i for i in range(12) if (place == i).any()]
-    level = np.array([median(signal[place == i]) for i in filled])
-    variance = np.array([median(squared[place == i]) for i in filled]) * MAD_TO_STD**2
+    ends = np.searchsorted(signal, edges[1:-1], "right")
+    classes = ([median(part) for part in np.split(one, ends) if len(part)] for one in (signal, squared))
+    level, variance = np.array(next(classes)), np.array(next(classes)) * MAD_TO_STD**2
     if steep:  # noise without signal is one more level: how coloured it is hardly counts
         level, variance = np.r_[0.0, level], np.r_[std**2, variance]
     # A pulse that misses its echoes leaves what grows with the square of the signal: only the linear part is noise.
