@@ -306,6 +306,7 @@ TOOLS = [
     ("voxelize strip.las --size 0 -o v.npz", 2, "not in the range 0<x"),
     ("voxelize strip.las --size nan -o v.npz", 2, "'--size': nan"),
     ("voxelize strip.las --size 1e-7 -o v.npz", 2, "too small .. take .. m or more"),
+    ("voxelize strip.las --size .001 -o v.npz", 2, "below a hundredth .. take 0.0015 m or more"),
     ("voxelize strip.las --size 1 -o v.tif", 2, ".npz, .las or .laz"), (f"{SURVEY} -o none/s.toml", 1, "none"),
     *((f"voxelize strip.las --size 1 -o none/{name}", 1, "make the folder first") for name in ("v.npz", "v.las")),
     (f"{VOXELS} --profiles p.csv", 2, ".npz"), (f"{VOXELS} --profiles v.npz", 2, "two outputs have this name"),

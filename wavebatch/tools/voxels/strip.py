@@ -361,6 +361,10 @@ def _doubt_returns(shown: np.ndarray, found: int, split: bool) -> Iterator[str]:
         )
 
 
+FINEST = 0.01
+"""Smallest voxel, over the way of light between two samples: fits of the strongest echoes place them no better."""
+
+
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
     """A position in the middle of the strip, f8 (3,) [m]; ConfigError where the voxels are too small for the strip."""
     path, size = reader.facts.path, options.size
@@ -382,6 +386,12 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
             )
     if size > options.size:
         raise ConfigError(f"--size {options.size:g}: too small for the extent of this strip; take {size:g} m or more")
+    finest = FINEST * HALF_C * min(block.spacing for block in blocks)
+    if options.size < finest:
+        raise ConfigError(
+            f"--size {options.size:g}: below a hundredth of the way between two samples, where nothing more is seen, "
+            f"but hours and disks are filled; take {finest:.2g} m or more"
+        )
     return middle
 
 
