@@ -23,7 +23,7 @@ from wavebatch.core.schema import Above, Range, declared_options
 from wavebatch.stages.chain import effective, load_profile
 from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.tools.plots.waveform import MOST
+from wavebatch.tools.plots.waveform import MOST_IN_PICTURE
 from wavebatch.tools.raster import ForestOptions
 from wavebatch.tools.scan_slices import Segment, SliceOptions
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, simulate_strip
@@ -345,7 +345,7 @@ PICTURES = [
     (f"{WAVEFORM} --packet 99999", 2, "there is no packet 99999; packets are 0 to"),
     (f"{WAVEFORM} --packet 5:3", 2, "'5:3' is empty; END is the number after the last one"),
     (f"{WAVEFORM} --packet x", 2, "neither a number nor FIRST:END"),
-    (f"{WAVEFORM} --packet 0:{MOST + 1}", 2, f"{MOST} fit"),
+    (f"{WAVEFORM} --packet 0:{MOST_IN_PICTURE + 1}", 2, f"{MOST_IN_PICTURE} fit"),
     (f"{WAVEFORM} --random 3 --packet 2", 2, "--random and --packet exclude each other"),
     (f"{WAVEFORM} --point 99999", 2, "there is no point 99999"),
     (f"{WAVEFORM} --gps-time 3", 2, "no pulse lies within"),

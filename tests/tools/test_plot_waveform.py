@@ -276,7 +276,7 @@ def test_no_error_bar_presses_the_waveform_into_a_line(tmp_path, error):
 def test_echoes_are_listed_and_written(tiny_strip, tmp_path):
     target = tmp_path / "e.csv"
     result = run(tiny_strip, "-o", target, "--packet", "0:30", "--profile", "balanced")
-    assert result.exit_code == 2 and f"{waveform.MOST} fit" in result.stderr
+    assert result.exit_code == 2 and f"{waveform.MOST_IN_PICTURE} fit" in result.stderr
     assert run(tiny_strip, "-o", target, "--packet", "0:20", "--profile", "balanced").exit_code == 0
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
         places = waveform.find_places(reader, scan, waveform.Wanted(packets=((0, 20),)), None)
@@ -323,7 +323,7 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
         drawn = [[place.packet for place in waveform.find_places(reader, scan, one, None)] for one in random]
         assert drawn[0] == drawn[1] == sorted(set(drawn[0])) and len(drawn[0]) == 40 and drawn[0] != drawn[2]
         assert len(waveform.find_places(reader, scan, waveform.Wanted(packets=((0, 60),), sheet=True), None)) == 60
-        with pytest.raises(ConfigError, match=f"{waveform.MOST} fit"):
+        with pytest.raises(ConfigError, match=f"{waveform.MOST_IN_PICTURE} fit"):
             waveform.find_places(reader, scan, waveform.Wanted(random=40), None)
         # As many as a sheet holds.
         assert len(waveform.find_places(reader, scan, waveform.Wanted(sheet=True), None)) == 100

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from commands import refuses, succeed
 from writer_tools import number_returns, write_points
 
-from wavebatch.cli.clouds import SHOWN, stats
+from wavebatch.cli.clouds import SHOWN_AREAS, stats
 from wavebatch.cli.strips import synthesize
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
@@ -398,7 +398,7 @@ def test_table_text_and_json_say_the_same(tmp_path):
     again = CliRunner().invoke(stats, arguments)
     assert again.exit_code != 0 and "exists already" in again.stderr
     out = CliRunner().invoke(stats, [*arguments, "--overwrite"]).stdout
-    assert f"and {len(found) - SHOWN} more; --json has all of them" in out and found[0]["name"] in out
+    assert f"and {len(found) - SHOWN_AREAS} more; --json has all of them" in out and found[0]["name"] in out
 
 
 def test_an_empty_cloud_has_no_area(tmp_path):

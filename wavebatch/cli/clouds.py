@@ -34,7 +34,7 @@ from wavebatch.tools.sheets.sheet import Fact, Note, Sheet, SheetPart, Table, fo
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others were counted."""
 
-SHOWN = 20
+SHOWN_AREAS = 20
 """Areas of a cloud that are printed: about a screen; -o and --json have all of them."""
 
 _COUNTED = ("by_number", "by_count")
@@ -129,7 +129,7 @@ def _sheet(found: returns.ReturnStats) -> Sheet:
              area.mean, area.least) for area in found.areas]  # fmt: skip
     head = ("area", "pulses", "each", *(f"{k} of pulse" for k in number), "pairs", "mean m", "least m")
     forms = ("", "", ".3f", *[".2%"] * len(number), "", ".3f", ".3f")
-    return Sheet(found.cloud, [*parts, Table(head, rows, forms, shown=SHOWN)])
+    return Sheet(found.cloud, [*parts, Table(head, rows, forms, shown=SHOWN_AREAS)])
 
 
 def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_count: int) -> dict[str, Any]:

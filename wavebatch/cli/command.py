@@ -229,7 +229,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 With the command in front where the name means something else in others."""
 
-FEWEST = 8
+FEWEST_GROUPED = 8
 """Pages with fewer options than this have no groups."""
 
 MANY, USUAL, ALSO_USUAL = 40, "Options that most runs need", ("html_file",)
@@ -382,7 +382,7 @@ def group_options(command: click.Command, ctx: click.Context) -> Iterator[tuple[
     names = ["help" if "--help" in option.opts else option.name for option in shown]
     found = zip(names, (option.get_help_record(ctx) for option in shown), strict=True)
     records = {name: record for name, record in found if record}
-    if len(records) < FEWEST:
+    if len(records) < FEWEST_GROUPED:
         yield "Options", list(records.values())
         return
     heading = {name: one.words.group for name, one in OPTIONS.items()}

@@ -267,7 +267,7 @@ def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
 
 _WANTED = 'it needs "features", each with "properties", and a "geometry" with "type" and "coordinates"'
 
-FARTHEST = 1e12
+LARGEST_COORDINATE = 1e12
 """Largest coordinate of a corner; squares and products of larger ones overflow."""
 
 
@@ -325,7 +325,7 @@ def load_polygons(path: Path | str) -> list[Polygon]:
     features, file = read_features(read_text(path, "polygon file", MOST_LIST), path)
     for number, (properties, rings) in enumerate(features, 1):
         for ring in rings:
-            if len(ring) < 3 or not (np.abs(ring) <= FARTHEST).all():
+            if len(ring) < 3 or not (np.abs(ring) <= LARGEST_COORDINATE).all():
                 raise ConfigError(f"{path}: polygon {number}: a ring needs three corners with finite coordinates")
         polygons.append(Polygon(str(properties.get("name") or number), tuple(rings), file))
     if not polygons:

@@ -39,7 +39,7 @@ LEAST_KNOWN = 20
 NEAR = 0.3
 """A pulse has the energy logged at most this share of the usual interval of the log before or after it."""
 
-LARGEST = 1e30
+LARGEST_ENERGY = 1e30
 """Energies from here on count as unknown: their squares overflow, and no unit is so small."""
 
 
@@ -106,7 +106,7 @@ class PulseEnergy:
         energy, error = self.read(records) / whole, None
         if self.error_field is not None:
             error = records[self.error_field].astype(np.float64) / whole
-            error = np.where((error >= 0) & (error < LARGEST), error, 0.0)
+            error = np.where((error >= 0) & (error < LARGEST_ENERGY), error, 0.0)
         if self.fills is not None and np.isnan(energy).any():
             unknown = np.isnan(energy)
             error = np.where(unknown, self.fills * self.level, 0.0 if error is None else error)
@@ -181,7 +181,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
         except (IndexError, ValueError) as error:
             raise InputError(f"{name}: a row has no number for time or energy: {error}") from error
         time, energy = columns
-        good = np.isfinite(time) & (energy < LARGEST) & (energy > 0)
+        good = np.isfinite(time) & (energy < LARGEST_ENERGY) & (energy > 0)
         if np.count_nonzero(good) < 2:
             raise InputError(f"{name}: fewer than two rows have a time and a positive energy")
         time, energy = time[good], energy[good]

@@ -234,7 +234,7 @@ def _read_descriptor(path: Path, index: int, payload: bytes) -> Descriptor:
     return Descriptor(extra, float(unit), scanner, tuple(samplings))
 
 
-PULSES = 50_000
+PIECE_PULSES = 50_000
 """Most pulses read at a time."""
 PIECE_BYTES = 1 << 25
 """Bytes of waves, about, that are read at a time; pulses that lie far apart are read in smaller pieces."""
@@ -325,7 +325,7 @@ class Waves:
 class PulseReader(Closing):
     """Reads the pulses of a PulseWaves file in order, piece by piece. A context manager.
 
-    pulses, size: most pulses (None: PULSES), and about the most bytes of waves, of a piece.
+    pulses, size: most pulses (None: PIECE_PULSES), and about the most bytes of waves, of a piece.
     """
 
     def __init__(self, header: PulseHeader, *, pulses: int | None = None, size: int = PIECE_BYTES) -> None:
@@ -334,7 +334,7 @@ class PulseReader(Closing):
         with undoing(self._pulses.close):
             self._waves = open_regular(header.waves)
         each = max(header.waves_size // max(header.count, 1), 1)
-        self._step = int(np.clip(size // each, 1, pulses or PULSES))
+        self._step = int(np.clip(size // each, 1, pulses or PIECE_PULSES))
 
     def close(self) -> None:
         """Close both files."""

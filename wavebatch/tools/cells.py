@@ -34,10 +34,10 @@ from wavebatch.files.las.read_points import read_checked_header
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
 
-MOST = (5.0, 95.0)
+HISTOGRAM_ENDS = (5.0, 95.0)
 """Percentiles of most values: histograms show 1.5 times their distance on both sides, which cuts only long tails."""
 
-MARGIN = 0.25
+EXTRA_EXTENT = 0.25
 """Also shown on both sides of these percentiles, as a share of the distance between them."""
 
 
@@ -211,13 +211,13 @@ def check_statistic(
 
 
 def shown_limits(samples: Sequence[np.ndarray], least: float, largest: float) -> tuple[float, float]:
-    """Limits that show the percentiles MOST of every sample, and 1.5 times their distance on both sides.
+    """Limits that show the percentiles HISTOGRAM_ENDS of every sample, and 1.5 times their distance on both sides.
 
     Rare far values would compress the rest. Samples of one value only are shown from `least` to `largest`.
     """
     ends = []
     for sample in filter(len, samples):
-        low, high = np.percentile(sample, MOST)
+        low, high = np.percentile(sample, HISTOGRAM_ENDS)
         near = sample[np.abs(sample - 0.5 * (low + high)) <= 2.0 * (high - low)]
         ends += [float(near.min()), float(near.max())] if len(near) else []
     return (min(ends), max(ends)) if ends and min(ends) < max(ends) else (least, largest)
@@ -226,7 +226,7 @@ def shown_limits(samples: Sequence[np.ndarray], least: float, largest: float) ->
 def robust_limits(sample: np.ndarray, least: float, largest: float) -> tuple[float, float]:
     """Limits of a picture of values from `least` to `largest`, without far outliers that would compress the rest."""
     low, high = np.percentile(sample, OUTER)
-    margin = MARGIN * (high - low)
+    margin = EXTRA_EXTENT * (high - low)
     if not margin:
         return least, largest
     return max(least, float(low - margin)), min(largest, float(high + margin))
@@ -434,13 +434,13 @@ LARGEST_EXTENT = 1e12
 CHOSEN_SIDE = 1500
 """Most cells along a side if the size of cells is not given: about the pixels of a picture."""
 
-FAR = 20.0
+FAR_APART = 20.0
 """Clouds may lie so many times the length of the longest one apart in one map: about three pixels per cloud remain."""
 
 POINTS_PER_CELL = 6
 """Mean number of points in a filled cell if the size of cells is not given."""
 
-SHOWN = (2.0, 98.0)
+SCALE_ENDS = (2.0, 98.0)
 """Percentiles of the cells at the ends of the colour scale."""
 
 _SIDE = 128
@@ -457,7 +457,7 @@ class Raster(CloudData):
     outside: int
     """Points with a value outside the grid."""
     shown: tuple[float, float]
-    """The percentiles SHOWN of the cells."""
+    """The percentiles SCALE_ENDS of the cells."""
     crs: CrsWords = CrsWords()
     """Of the clouds."""
 
@@ -510,9 +510,9 @@ def grid_values(
 
 
 def find_shown(values: np.ndarray) -> tuple[float, float]:
-    """Values at the ends of the colour scale: the percentiles SHOWN of the cells."""
+    """Values at the ends of the colour scale: the percentiles SCALE_ENDS of the cells."""
     known = values[np.isfinite(values)]
-    low, high = np.percentile(known, SHOWN).tolist() if len(known) else (0.0, 1.0)
+    low, high = np.percentile(known, SCALE_ENDS).tolist() if len(known) else (0.0, 1.0)
     return low, high
 
 
@@ -538,7 +538,7 @@ def survey_places(clouds: Clouds, bounds: Box | None = None, option: str = "--bb
     known = [number for number, place in enumerate(places) if len(place)]
     # Percentiles, so that a single damaged point moves no cloud.
     boxes = {number: np.percentile(places[number], (1, 99), axis=0) for number in known}
-    reach = FAR * max((float(np.hypot(*(box[1] - box[0]))) for box in boxes.values()), default=0.0)
+    reach = FAR_APART * max((float(np.hypot(*(box[1] - box[0]))) for box in boxes.values()), default=0.0)
     near = known[:1]
     for number in near:
         for other in known:
@@ -550,8 +550,8 @@ def survey_places(clouds: Clouds, bounds: Box | None = None, option: str = "--bb
         middle = [boxes[number].mean(axis=0) for number in (known[0], away[0])]
         raise ConfigError(
             f"{clouds.paths[away[0]]}: lies {float(np.hypot(*(middle[1] - middle[0]))):.6g} from "
-            f"{clouds.paths[known[0]]}, and the largest cloud is {reach / FAR:.4g} long: a picture of both would show "
-            f"neither; draw them one by one, or give {option}"
+            f"{clouds.paths[known[0]]}, and the largest cloud is {reach / FAR_APART:.4g} long: a picture of both would "
+            f"show neither; draw them one by one, or give {option}"
         )
     return total, sample, bounds or tuple(box.ravel().tolist())
 

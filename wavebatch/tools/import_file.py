@@ -225,7 +225,7 @@ def _list_notes(header: PulseHeader, plan: Plan, counts: ImportSummary, end: int
 
 MOST_DESCRIPTORS = 250
 """Wave packet descriptors that a strip gets: LAS has 255. With more lengths, lengths are rounded up."""
-SAMPLED = 2 * MOST_STACKED
+SAMPLED_PULSES = 2 * MOST_STACKED
 """Pulses of the sample, about."""
 ONE_TIME = 64
 """Pulses of one time from which that is no time."""
@@ -287,7 +287,7 @@ class Plan:
 
 def make_plan(reader: PulseReader) -> Plan:
     """Read all pulses once; raises InputError for a file without any returning segment, or that ends too early."""
-    header, every = reader.header, max(1, reader.header.count // SAMPLED)
+    header, every = reader.header, max(1, reader.header.count // SAMPLED_PULSES)
     codes: Counter[int] = Counter()  # segments by kind, and by channel
     channels: Counter[int] = Counter()
     overlaps: dict[int, Overlaps] = {}  # by the channel that was the primary one so far
@@ -642,7 +642,7 @@ class Overlaps:
 
 SCALE = 0.001
 """Largest unit of stored coordinates [m]: coarser ones would shift samples by as much."""
-ROUND = 1000.0
+OFFSET_STEP = 1000.0
 """Offsets of coordinates are multiples of this [m]."""
 _NO_WKT = (
     "the CRS stays as GeoTIFF keys: it is no UTM zone that wavebatch writes as WKT, which programs expect in LAS 1.4: "
@@ -701,7 +701,7 @@ def find_frame(reader: PulseReader) -> Frame:
         elif not keys.keys:
             notes = ("the file names no CRS",)
         frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
-    return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
+    return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / OFFSET_STEP) * OFFSET_STEP))
 
 
 _AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101

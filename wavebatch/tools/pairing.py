@@ -391,7 +391,7 @@ def _share(part: int, whole: int) -> float:
 
 _BOTH = ("echo_time", "amplitude", "echo_width")
 """Columns that are compared if both sides have them."""
-GROUPS = {"class": "classification", "echoes": "total"}
+GROUPED_BY = {"class": "classification", "echoes": "total"}
 """By what differences are grouped: the LAS class, and the number of echoes of the pulse."""
 
 
@@ -413,7 +413,7 @@ class Differences:
         self._sample = EvenSample(limit)
         self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
         self._grouped = {
-            (kind, side, name): np.zeros((256, 3)) for kind in GROUPS for side in "ab" for name in self.sums
+            (kind, side, name): np.zeros((256, 3)) for kind in GROUPED_BY for side in "ab" for name in self.sums
         }
 
     def add(self, a: np.ndarray, b: np.ndarray) -> None:
@@ -432,7 +432,7 @@ class Differences:
         for name, values in part.items():
             good = values[~np.isnan(values)]
             self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
-            for kind, column in GROUPS.items():
+            for kind, column in GROUPED_BY.items():
                 for side, rows in (("a", a), ("b", b)):
                     group = rows[column][~np.isnan(values)]
                     sums = self._grouped[kind, side, name]
@@ -442,7 +442,7 @@ class Differences:
             part[name] = a[name]
         for name in ("amplitude", "echo_width", "flags"):
             part[f"true_{name}"] = b[name]
-        for kind, column in GROUPS.items():
+        for kind, column in GROUPED_BY.items():
             part |= {f"{kind}_a": a[column], f"{kind}_b": b[column]}
         part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
         self._sample.add(part)
@@ -453,13 +453,13 @@ class Differences:
         return {name: _spread(sums, data[name]) for name, sums in self.sums.items() if sums[0]}
 
     def groups(self) -> dict[str, dict[int, dict[str, ErrorSpread]]]:
-        """The same by kind of GROUPS and by number: of the class, and of the echoes that the pulse has.
+        """The same by kind of GROUPED_BY and by number: of the class, and of the echoes that the pulse has.
 
         A pair belongs to the group of its echo of b; where b has no groups (all are 0), to that of its echo of a.
         Kinds in which both sides have none are left out. Medians of rare groups are NaN if the sample has none of them.
         """
         data, result = self._sample.read(), {}
-        for kind in GROUPS:
+        for kind in GROUPED_BY:
             side = next((side for side in "ba" if self._grouped[kind, side, "time"][1:, 0].any()), None)
             if side is None:
                 continue

@@ -282,7 +282,7 @@ BIN, BINS = 0.01, 10_000
 LEAST_PAIRS = 100
 """Fewer pairs give no dead zone."""
 
-EDGE = 0.001
+WITHIN_DEAD_ZONE = 0.001
 """Share of the distances that may lie within the dead zone, so that a few duplicate points do not hide it."""
 
 _NEXT = 10
@@ -308,11 +308,11 @@ def find_dead_zone(bins: np.ndarray) -> DeadZone:
     if pairs < LEAST_PAIRS:
         return DeadZone(pairs, math.nan, math.nan)
     below = np.cumsum(bins)
-    edge = int(np.searchsorted(below, EDGE * pairs, side="right"))
+    edge = int(np.searchsorted(below, WITHIN_DEAD_ZONE * pairs, side="right"))
     if edge == BINS - 1:
         return DeadZone(pairs, math.nan, math.nan)
     # The pairs that were left out may be pairs of surfaces: then the edge is as many gaps between pairs below.
-    rank = int(EDGE * pairs) + 1
+    rank = int(WITHIN_DEAD_ZONE * pairs) + 1
     gap = (int(np.searchsorted(below, rank + _NEXT)) - edge) * BIN / _NEXT
     return DeadZone(pairs, round(edge * BIN, 2), round(max(rank * gap, BIN), 3))
 

@@ -376,7 +376,7 @@ def _paint(piece: Slice) -> tuple[np.ndarray, tuple[float, float, float, float]]
     return image.reshape(height, width), (*edges_x, *edges_y)
 
 
-UNIT = "units of the strip"
+STRIP_UNIT = "units of the strip"
 """Of lengths and heights: the file does not say which they are."""
 
 _COLUMNS = {

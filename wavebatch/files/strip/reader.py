@@ -43,7 +43,7 @@ LONG, LONG_SAMPLES = 2048, 1 << 17
 """Of waveforms with more samples than LONG a sample of the strip has at most LONG_SAMPLES samples. No sensor records so
 much of one pulse; where all of it is echoes, a survey takes 50 us per sample, twenty times as long as the chain."""
 
-SAMPLE = 8192
+SAMPLE_WAVEFORMS = 8192
 """Waveforms that a survey looks at."""
 
 SAMPLE_SAMPLES = 1 << 21
@@ -298,7 +298,7 @@ class StripReader(Closing):
             for block, _ in self.read_blocks(unit, size, owned_only=True):
                 yield block
 
-    def sample_size(self, scan: StripScan, most: int = SAMPLE, samples: int = SAMPLE_SAMPLES) -> int:
+    def sample_size(self, scan: StripScan, most: int = SAMPLE_WAVEFORMS, samples: int = SAMPLE_SAMPLES) -> int:
         """Return how many waveforms of the strip are read, by default for a survey: at most so many, and samples."""
         used = (digitizer for index, digitizer in self.facts.digitizers.items() if index in scan.by_descriptor)
         longest = max((digitizer.n_samples for digitizer in used), default=0)

@@ -26,7 +26,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
 from wavebatch.files import toml_file
-from wavebatch.files.geojson import FARTHEST, AreaFile, find_inside, place_rings, read_features
+from wavebatch.files.geojson import LARGEST_COORDINATE, AreaFile, find_inside, place_rings, read_features
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text
 from wavebatch.surveying.calibration import Calibration
@@ -260,7 +260,7 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
     if not LEAST_REFLECTANCE <= reflectance <= 1.5:
         limits = f"{LEAST_REFLECTANCE:g} to 1.5, not in per cent"
         raise ConfigError(f"{where}: reflectance must lie in {limits}; it is {reflectance:g}")
-    if len(corners) < 3 or not (np.abs(corners) <= FARTHEST).all():
+    if len(corners) < 3 or not (np.abs(corners) <= LARGEST_COORDINATE).all():
         raise ConfigError(f"{where}: the outline needs three corners, or a radius above 0, and possible coordinates")
     if incidence is not None and not 0 <= incidence < 85:
         raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")

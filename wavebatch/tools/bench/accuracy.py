@@ -191,13 +191,13 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     return bounds
 
 
-CLEAR = 10.0
+CLEAR_SNR = 10.0
 """Signal to noise from which the error of an echo is compared with its bound."""
 
 GROSS = 10.0
 """Errors above this many bounds are gross: they are counted, but left out of error/bound."""
 
-GROUPS = 8
+SCENE_GROUPS = 8
 """Groups of a scene; each has one survey, like the strips of a project."""
 
 CM_PER_NS = 100 * HALF_C
@@ -239,18 +239,18 @@ def derive_seed(*numbers: int) -> int:
 def make_groups(
     scene: Scene, waveforms: int, seed: int, progress: Callable[[str], None] = lambda text: None
 ) -> list[Group]:
-    """`waveforms` waveforms of the scene in GROUPS groups, each with another seed and survey."""
-    size = max(waveforms // GROUPS, 1)
+    """`waveforms` waveforms of the scene in SCENE_GROUPS groups, each with another seed and survey."""
+    size = max(waveforms // SCENE_GROUPS, 1)
     groups = []
-    for place in range(GROUPS):
-        progress(f"{scene.name}: simulating and surveying, group {place + 1} of {GROUPS}")
+    for place in range(SCENE_GROUPS):
+        progress(f"{scene.name}: simulating and surveying, group {place + 1} of {SCENE_GROUPS}")
         ((block, truth),) = simulate_blocks(scene, size, seed=derive_seed(seed, place), size=size)
         groups.append(make_group(scene, place, block, truth, survey_block(block)))
     return groups
 
 
 def make_group(
-    scene: Scene, number: int, block: WaveformBlock, truth: EchoTable, survey: Survey, *, clear: float = CLEAR
+    scene: Scene, number: int, block: WaveformBlock, truth: EchoTable, survey: Survey, *, clear: float = CLEAR_SNR
 ) -> Group:
     """The group of a simulated block and its survey; clear: signal to noise from which echoes are compared.
 

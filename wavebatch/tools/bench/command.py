@@ -51,7 +51,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.publish import reporting
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
-from wavebatch.files.strip.reader import SAMPLE, StripReader
+from wavebatch.files.strip.reader import SAMPLE_WAVEFORMS, StripReader
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain import STAGES, Chain, Step, effective, load_chain_file, load_profile
 from wavebatch.stages.score import QUANTITIES
@@ -286,7 +286,7 @@ def shape_scene(strip: Path, chain: Chain) -> StripScene:
     Raises InputError where the strip cannot be read or holds too few waveforms.
     """
     with StripReader(strip) as reader, reader.scan() as scan:
-        blocks = [block for block in reader.sample_blocks(scan, SAMPLE) if len(block)]
+        blocks = [block for block in reader.sample_blocks(scan, SAMPLE_WAVEFORMS) if len(block)]
     kinds: dict[tuple[float, int], list[WaveformBlock]] = {}
     for block in blocks:
         kinds.setdefault((block.spacing, block.samples.shape[1]), []).append(block)
@@ -624,7 +624,7 @@ def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: flo
     """Draws one error against time."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-    from wavebatch.tools.plots.draw_cloud import MARKERS, SERIES
+    from wavebatch.tools.plots.draw_cloud import MARKERS, SERIES_COLORS
 
     twins = {row["same_as"]: row["name"] for row in rows if "same_as" in row}
     rows = [row for row in rows if "same_as" not in row]
@@ -645,7 +645,7 @@ def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: flo
     axes.plot(time[order], value[order], color="tab:red", zorder=1, label="Pareto front")
     for i, row in enumerate(known):
         names = " = ".join([row["name"], *filter(None, [twins.get(row["name"])])])
-        marker, color = MARKERS[i // len(SERIES) % len(MARKERS)], SERIES[i % len(SERIES)]
+        marker, color = MARKERS[i // len(SERIES_COLORS) % len(MARKERS)], SERIES_COLORS[i % len(SERIES_COLORS)]
         axes.errorbar(time[i], value[i], yerr=error[i], fmt=marker, color=color, capsize=2, label=names)
     axes.margins(x=0.25, y=0.15)
     axes.set_ylim(bottom=0)

@@ -24,7 +24,7 @@ from wavebatch.stages.chain import Chain
 from wavebatch.surveying.systems.survey_result import sample_pulse
 from wavebatch.tools.cells import Raster, Tally, choose_grid, compute_cells, find_shown, robust_limits
 from wavebatch.tools.compare_chains import find_residual
-from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
+from wavebatch.tools.plots.draw_cloud import SERIES_COLORS, add_colorbar, draw_cells
 from wavebatch.tools.plots.draw_waveform import HEAD, LEGEND, draw_small_waveforms, sheet_size
 from wavebatch.tools.plots.waveform import WaveformView, build_views
 from wavebatch.tools.sheets.sheet import Note, Picture, Sheet
@@ -44,7 +44,7 @@ SIZE = (4.2, 2.7)
 PLACE = (0.19, 0.18, 0.78, 0.69)
 """Of the axes in it: left, bottom, width and height."""
 
-SAMPLED = 400_000
+SAMPLED_POINTS = 400_000
 """Most points of the sample of a cloud."""
 
 MOST_CELLS = 160
@@ -88,8 +88,8 @@ def chart_pulse(system: SystemPulse, spacing: float, title: str = "System pulse"
 
     def draw(axes: Axes) -> None:
         axes.plot(time, gaussian, "--", color="#8a8a8a", linewidth=1, label="Gaussian of the same width")
-        axes.plot(time, pulse, color=SERIES[0], label="pulse of this strip")
-        axes.plot(at, np.interp(at, time, pulse), "o", color=SERIES[0], markersize=2.5)
+        axes.plot(time, pulse, color=SERIES_COLORS[0], label="pulse of this strip")
+        axes.plot(at, np.interp(at, time, pulse), "o", color=SERIES_COLORS[0], markersize=2.5)
         axes.set(xlim=(time[0], time[-1]), ylim=(min(0.0, float(pulse.min())) - 0.05, 1.35))
         axes.legend(loc="upper right", fontsize=7.5, borderaxespad=0.2)
 
@@ -119,7 +119,7 @@ def draw_histogram(edges: np.ndarray, counts: np.ndarray, *, title: str, label: 
         return []
 
     def draw(axes: Axes) -> None:
-        axes.stairs(merged, borders, fill=True, color=SERIES[0], alpha=0.75)
+        axes.stairs(merged, borders, fill=True, color=SERIES_COLORS[0], alpha=0.75)
         if log and borders[0] > 0:
             from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
@@ -153,7 +153,7 @@ def draw_counts(counts: Mapping[str, int] | Sequence[tuple[str, int]], *, title:
     rows = list(counts.items() if isinstance(counts, Mapping) else counts)
 
     def draw(axes: Axes) -> None:
-        axes.bar(range(len(rows)), [number for _, number in rows], color=SERIES[0], alpha=0.75)
+        axes.bar(range(len(rows)), [number for _, number in rows], color=SERIES_COLORS[0], alpha=0.75)
         axes.set_xticks(range(len(rows)), [name for name, _ in rows], fontsize=8)
         axes.grid(axis="x", visible=False)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value == round(value) else "")
@@ -196,7 +196,7 @@ def draw_values(
         middle, spread, label = middle / 10.0**power, spread / 10.0**power, f"1e{power} {label}"
 
     def draw(axes: Axes) -> None:
-        axes.errorbar(np.arange(len(names)) + 1, middle, yerr=spread, fmt="o", color=SERIES[0], capsize=3)
+        axes.errorbar(np.arange(len(names)) + 1, middle, yerr=spread, fmt="o", color=SERIES_COLORS[0], capsize=3)
         axes.set_xticks(np.arange(len(names)) + 1)
         axes.margins(x=0.1, y=0.15)
 
@@ -223,7 +223,7 @@ def picture_cloud(path: Path, columns: Sequence[str]) -> Iterator[Sheet]:
 
     Raises InputError if it cannot be read. `wavebatch plot` and `wavebatch grid` show every point, and finer cells.
     """
-    sample = EvenSample(SAMPLED)
+    sample = EvenSample(SAMPLED_POINTS)
     with ColumnReader(path, *columns, missing_ok=True) as reader:
         for rows in reader.read_pieces():
             good = np.isfinite(rows["x"]) & np.isfinite(rows["y"])

@@ -231,11 +231,11 @@ def count_points_by_flag(paths: Sequence[Path], column: str, selection: PointFil
     return FlagCounts(clouds.facts, tuple(flag.name for flag in EchoFlag), total, names, counts, clean)
 
 
-SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
+SERIES_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
 """Colours of Okabe and Ito, which colour-blind readers can distinguish; more than eight series repeat them."""
 
 MARKERS = "os^Dv*"
-"""Marks of points; each serves for a round of SERIES."""
+"""Marks of points; each serves for a round of SERIES_COLORS."""
 
 MOST_TOGETHER = 6
 """Most series in one axes: more lines cannot be followed."""
@@ -285,8 +285,8 @@ def _draw_histogram(axes: Axes, found: Histogram, *, log: bool, counts: bool) ->
     unit = "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
     alone = len(found.counts) == 1
     for series, (low_end, middle, high_end) in enumerate(found.percentiles):
-        color = SERIES[series % len(SERIES)]
-        style = "-" if series < len(SERIES) else (0, (3, 1))
+        color = SERIES_COLORS[series % len(SERIES_COLORS)]
+        style = "-" if series < len(SERIES_COLORS) else (0, (3, 1))
         number = int(found.values[series])
         shown = found.counts[series] if counts else found.counts[series] * (100.0 / max(number, 1))
         if alone:
@@ -342,7 +342,7 @@ def draw_flags(found: FlagCounts, target: Path, *, log: bool = False, overwrite:
         axes = figure.subplots()
         flags, counts = ["no flag", *found.names], np.array([found.clean, *found.counts.tolist()])
         place = np.arange(len(flags))
-        axes.barh(place, counts, color=["#8a8a8a", *[SERIES[0]] * len(found.names)], height=0.7)
+        axes.barh(place, counts, color=["#8a8a8a", *[SERIES_COLORS[0]] * len(found.names)], height=0.7)
         axes.set_yticks(place, flags)
         axes.invert_yaxis()
         axes.grid(axis="y", visible=False)

@@ -280,7 +280,7 @@ def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float])
     axes.set_ylim(low - 0.05 * (high - low), high + 0.17 * (high - low))
 
 
-CELL = (2.3, 1.9)
+PANEL_SIZE = (2.3, 1.9)
 """Width and height of a small picture [inch]."""
 
 HEAD, FOOT = 0.45, 0.25
@@ -330,7 +330,7 @@ def draw_waveform_sheet(
 
 def sheet_size(number: int, columns: int) -> tuple[float, float]:
     """Size of a sheet of so many pictures [inch]."""
-    return CELL[0] * columns, CELL[1] * -(-number // columns) + HEAD + FOOT
+    return PANEL_SIZE[0] * columns, PANEL_SIZE[1] * -(-number // columns) + HEAD + FOOT
 
 
 def draw_small_waveforms(
@@ -341,9 +341,9 @@ def draw_small_waveforms(
     size = figure.get_size_inches()
     for number, view in enumerate(views):
         row, column = divmod(number, columns)
-        left = (column * CELL[0] + 0.3) / size[0]
-        bottom = (size[1] - head - (row + 1) * CELL[1] + 0.25) / size[1]
-        width, height = (CELL[0] - 0.4) / size[0], (CELL[1] - 0.5) / size[1]
+        left = (column * PANEL_SIZE[0] + 0.3) / size[0]
+        bottom = (size[1] - head - (row + 1) * PANEL_SIZE[1] + 0.25) / size[1]
+        width, height = (PANEL_SIZE[0] - 0.4) / size[0], (PANEL_SIZE[1] - 0.5) / size[1]
         upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))
         lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
         shown = times or view.span
@@ -364,5 +364,5 @@ def draw_small_waveforms(
         flags = EchoFlag(int(np.bitwise_or.reduce(view.echoes.flags, initial=0))) & ~QUIET_FLAGS
         names = ", ".join(flag.name for flag in flags)
         title = "   ".join(filter(None, (name, strongest, *notes[number : number + 1])))
-        title = fit_text(figure, title + (f"\n{names}" if names else ""), CELL[0] - 0.45, size=6.5)
+        title = fit_text(figure, title + (f"\n{names}" if names else ""), PANEL_SIZE[0] - 0.45, size=6.5)
         upper.set_title(title, fontsize=6.5, pad=2)

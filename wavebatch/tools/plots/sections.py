@@ -20,8 +20,8 @@ from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools import cells
-from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.slice_output import UNIT, SegmentFiles, is_segments
+from wavebatch.tools.plots.draw_cloud import SERIES_COLORS, add_colorbar, name_clouds
+from wavebatch.tools.slice_output import STRIP_UNIT, SegmentFiles, is_segments
 from wavebatch.tools.voxels.grid import VoxelFile
 
 MOST_POINTS = 200_000
@@ -30,7 +30,7 @@ MOST_POINTS = 200_000
 MOST_BINS = 5000
 """Most bins of a profile."""
 
-LEAST = 20
+FEWEST_JUDGED = 20
 """Least number of heights among which one can be an outlier."""
 
 _CHOSEN_BINS = 60
@@ -154,13 +154,13 @@ def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
     """Least and largest height that a section shows, of heights (n,): not the few that lie far from all others.
 
     At each end the thousandth that is farthest, but at least one, is left out where it lies farther from the rest than
-    MARGIN of its extent and than a tenth of the section's length. Fewer than LEAST heights have no outliers.
+    EXTRA_EXTENT of its extent and than a tenth of the section's length. Fewer than FEWEST_JUDGED heights have none.
     """
     few = math.ceil(0.001 * len(height))
-    if len(height) < LEAST:
+    if len(height) < FEWEST_JUDGED:
         return -math.inf, math.inf
     rest = np.sort(height)[few:-few]
-    reach = max(cells.MARGIN * float(rest[-1] - rest[0]), 0.1 * length)
+    reach = max(cells.EXTRA_EXTENT * float(rest[-1] - rest[0]), 0.1 * length)
     return float(rest[0]) - reach, float(rest[-1]) + reach
 
 
@@ -266,7 +266,7 @@ def measure_profile(
     kind, unit = "clouds", crs.upright_unit
     more = {"upright": crs.upright}
     if isinstance(clouds, SegmentFiles):
-        kind, unit, more = "files", UNIT, {"noun": "segments"}
+        kind, unit, more = "files", STRIP_UNIT, {"noun": "segments"}
     names = names if each or len(paths) == 1 else (f"{len(paths)} {kind}",)
     return Profile(clouds.facts, names, total, statistic, edges, values, outside, unit, **more)
 
@@ -356,7 +356,7 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
     with open_picture(target, (6.0, 6.0 + 0.2 * len(found.names)), overwrite=overwrite) as figure:
         axes = figure.subplots()
         for number, values in enumerate(found.values):
-            color = SERIES[number % len(SERIES)]
+            color = SERIES_COLORS[number % len(SERIES_COLORS)]
             label = fit_text(figure, plain_text(found.names[number], 200), 4.5, size=8.5)
             alone = len(found.values) == 1 and found.statistic != "mean"
             if alone:

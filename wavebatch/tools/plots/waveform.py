@@ -36,11 +36,11 @@ from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.sensor import SensorRequest, find_sensor
 from wavebatch.tools.sheets.sheet import format_csv
 
-FARTHEST = 1e-3
+FARTHEST_IN_TIME = 1e-3
 """Largest distance of a pulse from the wanted GPS time [s]."""
-FEW = 6
+USUAL_IN_PICTURE = 6
 """Waveforms of a picture if their number is not given."""
-MOST = 24
+MOST_IN_PICTURE = 24
 """Most waveforms of a picture: more would be too small to read."""
 MOST_ON_SHEET = 100
 """Most waveforms of a contact sheet."""
@@ -61,7 +61,7 @@ class Wanted:
     selection: PointFilter = PointFilter()
     """The first waveforms with an echo that it chooses."""
     most: int | None = None
-    """Most waveforms with such an echo, or spread evenly; None: FEW of them, or a full sheet."""
+    """Most waveforms with such an echo, or spread evenly; None: USUAL_IN_PICTURE of them, or a full sheet."""
     random: int = 0
     """Number of packets to draw at random; 0: none."""
     seed: int = 0
@@ -72,12 +72,12 @@ class Wanted:
     @property
     def limit(self) -> int:
         """Most waveforms of the picture."""
-        return MOST_ON_SHEET if self.sheet else MOST
+        return MOST_ON_SHEET if self.sheet else MOST_IN_PICTURE
 
     @property
     def number(self) -> int:
         """Most waveforms with chosen echoes, or spread evenly."""
-        return self.most or (MOST_ON_SHEET if self.sheet else FEW)
+        return self.most or (MOST_ON_SHEET if self.sheet else USUAL_IN_PICTURE)
 
 
 @frozen
@@ -152,9 +152,9 @@ def find_places(
         if not wanted.times and len(found) == len({*numbers}) + len({*wanted.points}):
             break
     for time, apart in away.items():
-        if apart > FARTHEST:
+        if apart > FARTHEST_IN_TIME:
             why = f"the nearest is {apart:g} s away" if np.isfinite(apart) else "no pulse has a time"
-            raise ConfigError(f"{path}: no pulse lies within {FARTHEST:g} s of GPS time {time!r}: {why}")
+            raise ConfigError(f"{path}: no pulse lies within {FARTHEST_IN_TIME:g} s of GPS time {time!r}: {why}")
     for number in numbers:
         if ("packet", number) not in found:
             raise InputError(f"{path}: packet {number} was not found; the file changed while it was read")
@@ -219,7 +219,7 @@ def _plan(selection: PointFilter, some: EchoTable) -> PlannedFilter:
 
 # Views
 
-FINE = 8
+CURVE_POINTS = 8
 """Points of a curve per sample."""
 MOST_POINTS = 20_000
 """Most points of a curve: more than any picture resolves."""
@@ -357,7 +357,7 @@ def build_views(
         clipped = samples >= level
         baseline, std = float(noise.baseline[row]), float(noise.std[row])
         time = np.arange(len(samples)) * block.spacing
-        fine = np.linspace(0.0, time[-1], max(len(time), min(FINE * (len(time) - 1) + 1, MOST_POINTS)))
+        fine = np.linspace(0.0, time[-1], max(len(time), min(CURVE_POINTS * (len(time) - 1) + 1, MOST_POINTS)))
         curves, total, fit, residual = [], np.zeros(len(fine)), np.zeros(len(time)), None
         if shape is not None:
             # One echo after the other: long waveforms have hundreds.

@@ -34,7 +34,7 @@ from wavebatch.tools.sheets.survey import survey_sheet
 PICTURED = ("amplitude", "echo_width", "range_err", "range", "reflectance", "cross_section", "incidence_angle")
 """Columns with a histogram and a map, where the cloud has them."""
 
-FEW = 4
+FEW_STRIPS = 4
 """So many strips all have a part."""
 
 MOST_PARTS = 8
@@ -55,10 +55,10 @@ FIGURES: dict[str, tuple[str, str, float]] = {
 }
 """By key: head of the column, form of the number, and the smallest difference that counts."""
 
-FEWEST = 5
+FEWEST_COMPARED = 5
 """Fewer strips than this have no usual value."""
 
-FARTHEST = 3.5
+USUAL_REACH = 3.5
 """Largest usual distance from the median in robust standard deviations (Iglewicz and Hoaglin 1993)."""
 
 LEAST_SHARE = 0.05
@@ -98,7 +98,8 @@ def write_run_page(target: Path, result: BatchResult, folder: Path, command: str
     # Strips to look at come first, in the table and where there are too many to show all.
     order = sorted(strips, key=lambda one: (not (one.outcome.error or one.outcome.report.warnings),
                                             not marks[one.number], one.number))  # fmt: skip
-    most = min(MOST_PARTS, 1 + result.report.count("waveforms") // PART_WAVEFORMS) if len(strips) > FEW else FEW
+    allowed = min(MOST_PARTS, 1 + result.report.count("waveforms") // PART_WAVEFORMS)
+    most = allowed if len(strips) > FEW_STRIPS else FEW_STRIPS
     shown = [one for one in order if one.has_report][:most]
     names = strips[0].outcome.job.path.name if len(strips) == 1 else f"{len(strips)} strips"
     links = [("strips", "All strips"), *((one.mark, one.outcome.job.path.name) for one in shown), ("run", "Run")]
@@ -143,10 +144,10 @@ def find_outliers(strips: Sequence[Mapping[str, float]], sensors: Sequence[str])
         for key, (_, form, least) in FIGURES.items():
             values = np.array([strips[place].get(key, math.nan) for place in places], np.float64)
             known = values[np.isfinite(values)]
-            if len(known) < FEWEST:
+            if len(known) < FEWEST_COMPARED:
                 continue
             median = float(np.median(known))
-            limit = max(FARTHEST * robust_std(known), LEAST_SHARE * abs(median), least)
+            limit = max(USUAL_REACH * robust_std(known), LEAST_SHARE * abs(median), least)
             for place, value in zip(places, values, strict=True):
                 if abs(value - median) > limit:
                     found[place][key] = f"{value:{form}}; usual is {median:{form}} \u00b1 {limit:{form}}"
@@ -201,9 +202,9 @@ def _list_parts(
 
 def _list_index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int]) -> Iterator[SheetPart]:
     """A row per strip, with what is unusual of it."""
-    few = len(strips) < FEWEST
+    few = len(strips) < FEWEST_COMPARED
     yield Note(
-        f"Strips are compared with each other if there are at least {FEWEST} of one sensor." if few else
+        f"Strips are compared with each other if there are at least {FEWEST_COMPARED} of one sensor." if few else
         f"{sum(map(bool, marks))} of {len(strips)} strips differ in a figure from the others of their sensor: these "
         "are marked with \u25b2. It is a reason to look at the strip, not a fault."
     )  # fmt: skip

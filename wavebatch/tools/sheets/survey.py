@@ -374,13 +374,13 @@ def write_angles(
         columns = found.angle, found.spread, found.width, found.error, *same
         write_text(target, sheets.format_csv(head, zip(*columns, strict=True), digits=6), overwrite=overwrite)
         return
-    from wavebatch.tools.plots.draw_cloud import SERIES
+    from wavebatch.tools.plots.draw_cloud import SERIES_COLORS
 
     with open_picture(target, (7.0, 6.0), overwrite=overwrite) as figure:
         axes, errors = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
-        axes.plot(found.width, found.angle, color=SERIES[0], linewidth=1.5)
+        axes.plot(found.width, found.angle, color=SERIES_COLORS[0], linewidth=1.5)
         axes.set(ylim=(0, 90), ylabel="incidence angle [deg]")
-        for one, color in zip(tables, SERIES, strict=False):
+        for one, color in zip(tables, SERIES_COLORS, strict=False):
             errors.plot(one.width, one.error, color=color, linewidth=1.2, label=f"echoes of {one.amplitude:.0f} DN")
         errors.set_yscale("log")
         errors.yaxis.set_major_formatter(lambda value, _: f"{value:g}")

@@ -281,7 +281,7 @@ def main_lobe(z: np.ndarray, kappa: float) -> np.ndarray:
     return np.where(gone, 0, np.exp(-0.5 * level * level)).astype(z.dtype)
 
 
-REACH = 5.5
+LOBE_REACH = 5.5
 """Lobes are painted this many sigma to both sides: beyond it they are below 3e-7 of their height."""
 
 MOST_NOISE = 1e10
@@ -381,9 +381,9 @@ def paint_echoes(
     jobs = []
     for number, (start, height, width) in enumerate(spread_lobes(recording.pulse, time, amplitude, sigma)):
         kappa = recording.pulse.kappa if number == 0 else 0.0
-        long_side = (np.expm1(REACH * abs(kappa)) / abs(kappa) if abs(kappa) > 1e-6 else REACH) * width
-        left = np.ceil((long_side if kappa < 0 else REACH * width) / recording.spacing).astype(np.int64)
-        right = np.ceil((long_side if kappa > 0 else REACH * width) / recording.spacing).astype(np.int64)
+        long_side = (np.expm1(LOBE_REACH * abs(kappa)) / abs(kappa) if abs(kappa) > 1e-6 else LOBE_REACH) * width
+        left = np.ceil((long_side if kappa < 0 else LOBE_REACH * width) / recording.spacing).astype(np.int64)
+        right = np.ceil((long_side if kappa > 0 else LOBE_REACH * width) / recording.spacing).astype(np.int64)
         length = -(-(left + right + 1) // 8) * 8
         jobs.append((start, height, width, left, length, kappa))
     pad = max((int(job[4].max(initial=8)) for job in jobs), default=8)

@@ -265,7 +265,7 @@ def fill_shares(share: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]
     return filled, int(np.count_nonzero(total > 1.0 + _TOLERANCE))
 
 
-WEAKEST = 3.0
+WEAKEST_RETURN = 3.0
 """Echoes below this many standard deviations of the noise give no return."""
 
 DISTINCT = 1.0
@@ -359,7 +359,7 @@ def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, k
     without echo gets one stand-in return in the middle of its window.
     """
     inside = (truth.time >= 0) & (truth.time <= recording.duration)
-    inside &= truth.amplitude >= WEAKEST * recording.recorded_noise
+    inside &= truth.amplitude >= WEAKEST_RETURN * recording.recorded_noise
     echoes = truth.take(np.flatnonzero(inside))
     if len(echoes):  # the strongest of every run of echoes that a discrete receiver cannot separate
         width = FWHM_PER_SIGMA * echoes.sigma
@@ -400,7 +400,7 @@ def fill_packets(
         points[name] = np.where(has, -step[:, axis] / PS_PER_NS, 0)
 
 
-MARGIN = 6.0
+END_MARGIN = 6.0
 """Time before the first and after the last return of a pulse, in standard deviations of the pulse."""
 
 FULL_SHARE = 0.8
@@ -510,7 +510,7 @@ def synthesize_strip(
                 ray = fit_rays(rows["xyz"], starts, rows["scan_angle"], rows["source"])
                 strength, sigma = light.measure(rows, records, starts)
                 delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
-                margin = MARGIN * np.maximum.reduceat(sigma, starts)
+                margin = END_MARGIN * np.maximum.reduceat(sigma, starts)
                 phase = options.spacing * rng.random(len(starts))
                 time = delay + (margin + phase - np.minimum.reduceat(delay, starts))[pulse]
                 n_samples = np.ceil((np.maximum.reduceat(time, starts) + margin) / options.spacing) + 1

@@ -36,7 +36,7 @@ from wavebatch.tools.simulate.render import (
     trace_rays,
 )
 
-MARGIN = 6.0
+END_MARGIN = 6.0
 """Distance that echoes keep from the ends of the window, in sigma of the pulse."""
 
 
@@ -74,8 +74,8 @@ class Canopy:
         left = np.exp(before - np.repeat(before[ground - plants], count))
         taken[ground] = 1.0
         sigma = recording.pulse.sigma
-        room = max(recording.duration - self.duration - 2 * MARGIN * sigma, 0.0)
-        start = MARGIN * sigma + room * rng.random(n)
+        room = max(recording.duration - self.duration - 2 * END_MARGIN * sigma, 0.0)
+        start = END_MARGIN * sigma + room * rng.random(n)
         return Drawn(waveform, start[waveform] + depth, self.full * taken * left, np.full(len(waveform), sigma))
 
 
@@ -522,7 +522,7 @@ SEED_SAMPLES = SEED_BLOCK * 2048
 NEIGHBOUR = 4.0
 """Echoes closer than this many sigma (of the wider one) count as overlapped (docs/algorithms.md 2.2)."""
 
-EDGE = 2.0
+EDGE_REACH = 2.0
 """Echoes closer than this many sigma to an end of the window count as near the edge (docs/algorithms.md H8)."""
 
 WEAK = 5.0
@@ -627,6 +627,6 @@ def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
     """The truth with flags for what makes an echo hard to find: OVERLAPPED, NEAR_EDGE, SATURATED, WEAK."""
     depth = np.minimum(truth.time, recording.duration - truth.time)
     truth = truth.with_flags(EchoFlag.OVERLAPPED, has_neighbour(truth, NEIGHBOUR))
-    truth = truth.with_flags(EchoFlag.NEAR_EDGE, depth < EDGE * truth.sigma.astype(np.float64))
+    truth = truth.with_flags(EchoFlag.NEAR_EDGE, depth < EDGE_REACH * truth.sigma.astype(np.float64))
     truth = truth.with_flags(EchoFlag.SATURATED, truth.amplitude + recording.baseline > recording.clip)
     return truth.with_flags(EchoFlag.WEAK, truth.amplitude < WEAK * recording.recorded_noise)

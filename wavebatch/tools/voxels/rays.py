@@ -58,10 +58,10 @@ SNR = 20.0
 SUPPORT = 2.0
 """Smoothed samples above this many standard deviations of their noise may hold signal."""
 
-FLOOR = 0.1
+LEAST_TO_KEEP = 0.1
 """Deconvolved samples below this share of the least signal, spread over the pulse, are set to zero."""
 
-BACKGROUND = 3.0
+ADDED_LEVEL = 3.0
 """Level added to waveform and model of the Richardson-Lucy iteration, which needs positive values [noise std]."""
 
 TOLERANCE = 2.5
@@ -149,7 +149,7 @@ def deconvolve_block(
         box = np.ones(2 * max(int(round(width)), 1) + 1)
         error = np.sqrt(np.sum(np.convolve(inverse, box) ** 2))
     least = options.threshold * float(error)
-    floor = FLOOR * max(least, 1e-3) / max(width, 1.0)
+    floor = LEAST_TO_KEEP * max(least, 1e-3) / max(width, 1.0)
     value, seen = np.zeros((n, s)), np.zeros(n, bool)
     # Waveforms with windows of equal length together; those without signal are left out.
     order = np.argsort(length, kind="stable")
@@ -165,7 +165,7 @@ def deconvolve_block(
         elif options.method == "gold":
             profile = deconvolve.deconvolve_gold(part, taps, options.steps)
         else:
-            level = np.float32(BACKGROUND) * noise.std[rows]
+            level = np.float32(ADDED_LEVEL) * noise.std[rows]
             profile = deconvolve.deconvolve_richardson_lucy(part, taps, level, options.steps)
         near = np.ascontiguousarray(support[place, rows].T)
         kept, seen[rows] = deconvolve.keep_signal(np.ascontiguousarray(profile.T), near, least * std, floor * std)
@@ -258,10 +258,10 @@ class CellMap:
         return np.where(self._key[at] == key, at, -1)
 
 
-CELL = 5.0
+GROUND_CELL = 5.0
 """Cell of the map [m]: in each, some return should have reached the ground."""
 
-STEEPEST = 0.5
+STEEPEST_GROUND = 0.5
 """Least vertical part of the normal of a cell's ground: steeper planes are no ground, the cell is level."""
 
 LEAST_AROUND = 4
@@ -278,7 +278,7 @@ class Floor(CellMap):
     """
 
     def __init__(self, middle: np.ndarray, most: int = MOST_CELLS) -> None:
-        super().__init__(middle, CELL, highest=False, most=most)
+        super().__init__(middle, GROUND_CELL, highest=False, most=most)
         self._slope = np.empty((0, 2))
         self.steep = 0.0
         """Rise per metre that half of the planes exceed: roofs, where they are the lowest returns, are fewer."""
@@ -290,7 +290,7 @@ class Floor(CellMap):
         offset = self._kept[row[cell, number]] - self._kept[cell]
         planes = fit_planes(offset, cell, len(row))
         normal = np.where(planes.normal[:, 2:] < 0, -planes.normal, planes.normal)
-        usable = (planes.kept >= LEAST_AROUND) & (normal[:, 2] >= STEEPEST)
+        usable = (planes.kept >= LEAST_AROUND) & (normal[:, 2] >= STEEPEST_GROUND)
         usable &= planes.spreads[:, 1] > (LEAST_WIDTH * self.cell) ** 2
         up = np.where(usable, normal[:, 2], 1.0)[:, None]
         self._slope = np.where(usable[:, None], -normal[:, :2] / up, 0.0)
@@ -319,10 +319,10 @@ LEAST_CELL = 4.0
 VOXELS_PER_CELL = 4.0
 """Least cell of the map, in voxels."""
 
-MARGIN = 3.0
+ABOVE_RETURNS = 3.0
 """Height above the highest return up to which there can be signal without a return [m]."""
 
-STEEP = 0.1
+FLATTEST_RAY = 0.1
 """Least vertical part of a ray: flatter rays are not followed upwards."""
 
 MOST_STEPS = 1024
@@ -343,7 +343,7 @@ class Ceiling(CellMap):
         """Raises every cell to the highest around it; returns the map."""
         self._key, row = np.unique(self._key[:, None] + AROUND, return_inverse=True)
         self._top = np.full(len(self._key), -np.inf)
-        np.maximum.at(self._top, row.ravel(), np.repeat(self._kept[:, 2] + MARGIN, len(AROUND)))
+        np.maximum.at(self._top, row.ravel(), np.repeat(self._kept[:, 2] + ABOVE_RETURNS, len(AROUND)))
         return self
 
     def measure_headroom(self, start: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -351,7 +351,7 @@ class Ceiling(CellMap):
         with np.errstate(invalid="ignore", divide="ignore"):
             up = -step / np.sqrt((step * step).sum(axis=1))[:, None]
         headroom = np.zeros(len(start))
-        rows = np.flatnonzero((up[:, 2] >= STEEP) & np.isfinite(start).all(axis=1))
+        rows = np.flatnonzero((up[:, 2] >= FLATTEST_RAY) & np.isfinite(start).all(axis=1))
         for number in range(MOST_STEPS):
             way = number * self.cell
             place = start[rows] + up[rows] * way
@@ -646,7 +646,7 @@ LEAST_CANOPY = 0.01
 LEAST_LEFT = 0.01
 """Light that is lost to a hundredth is not known at all."""
 
-WEAKEST = 0.05
+HIDDEN_QUANTILE = 0.05
 """Quantile of the light in packets that is stated as the most that a gap between packets hides."""
 
 
@@ -715,7 +715,7 @@ def find_rule(sample: Sequence[Rays], given: float | None, louder: Sequence[Rays
     rule = replace(
         rule,
         usual=float(light[light > 0].mean()) if (light > 0).any() else 0.0,
-        hidden_light=float(np.quantile(share, WEAKEST)) if len(share) else None,
+        hidden_light=float(np.quantile(share, HIDDEN_QUANTILE)) if len(share) else None,
     )
     if not louder or rule.source not in ("strip", "given"):
         return rule

@@ -42,10 +42,10 @@ from wavebatch.surveying.systems.figures import describe_system
 from wavebatch.tools.voxels import grid as voxel_grid
 from wavebatch.tools.voxels import rays
 
-LARGEST = 1e6
+LARGEST_VOXEL = 1e6
 """Largest voxel [m]."""
 
-SAMPLED = 4096
+SAMPLED_PULSES = 4096
 """Pulses from which the reflectance ratio is estimated."""
 
 WIDE = 1.0
@@ -78,7 +78,7 @@ USUAL = 1000.0
 class VoxelOptions(CheckedOptions):
     """How a strip becomes voxels."""
 
-    size: Annotated[float, Above(0.0, LARGEST)] = option(
+    size: Annotated[float, Above(0.0, LARGEST_VOXEL)] = option(
         MISSING, "Edge of a voxel [m]; the faces of voxels lie at multiples of it.", form="M"
     )
     deconvolution: rays.Deconvolution = field(default_factory=rays.Deconvolution)
@@ -230,7 +230,7 @@ def voxelize_strip(
         if options.forest:
             doubts += (*_doubt_footprints(footprint, floor.steep, options.ground_height),)
         numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
-        each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
+        each = -(-SAMPLED_PULSES // max(len(numbers), 1))  # spread evenly over the strip
         batches = rays.read_batches(
             reader, scan, numbers=numbers.tolist(), choose=lambda rows: rows[even_places(len(rows), each)]
         )
@@ -380,7 +380,7 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
     begin = np.full(len(end), -(options.headroom or 0.0) / HALF_C)
     while np.mean(fits_keys(start - middle, step, begin, end, size)) < _MOST_FITTING:
         size *= 2
-        if size > LARGEST:
+        if size > LARGEST_VOXEL:
             raise InputError(
                 f"{path}: its coordinates are spread over more than a grid can hold; see `wavebatch check`"
             )
