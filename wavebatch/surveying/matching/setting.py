@@ -286,13 +286,14 @@ def compare_ground(
         return None
     # Warming up, or failing for a time, moves parts of the strip.
     found = []
-    for order in (np.argsort(one, kind="stable") for one in (time, side)):
+    for place, most in ((time, USUAL_CHANGE), (side, USUAL_SIDES)):
+        order = np.argsort(place, kind="stable")
         parts = np.array_split(off[order], len(off) // LEAST_COMMON)
         middles = np.array([float(np.sort(part)[len(part) // 4 : -(len(part) // 4)].mean()) for part in parts])
         rest = np.concatenate([part - middle for part, middle in zip(parts, middles, strict=True)])
         rest = np.clip(rest, -BORDER * robust_std(rest), BORDER * robust_std(rest))
         doubt = float(np.hypot(MEDIAN_ERROR * np.std(rest) * (len(parts) / len(off)) ** 0.5, SAME_GROUND))
-        found.append(weigh_change(float(np.std(middles)), doubt, chance=chance)._replace(is_uneven=True))
+        found.append(weigh_change(float(np.std(middles)), doubt, chance=chance, most=most)._replace(is_uneven=True))
     uneven, across = found[0], found[1]._replace(shift=float(np.quantile(np.abs(middles), 0.68)))
     # Neighbours on two sides of a field's border say nothing.
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
