@@ -18,7 +18,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, median, quantile, robust_std
-from wavebatch.core.trajectory import Trajectory, solve_offset
+from wavebatch.core.trajectory import JUMP_SCATTER, LEAST_JUMP, Trajectory, solve_offset
 from wavebatch.core.units import AIR_ATTENUATION, name_first
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.raw_bytes import naming
@@ -43,6 +43,9 @@ MOST_RAYS = 512
 
 MOST_NODES = 20_000
 """Most positions along a path, 2.8 hours: a longer time range means that GPS times are wrong."""
+
+STEADY = 9.8
+"""Most that windows of rays find a sensor accelerated [m/s2]: an aircraft that holds its height has far less."""
 
 BEYOND = 0.25
 """Time for which a path goes straight on after its last ray [s]: only a sample of a strip's rays is used."""
@@ -242,6 +245,11 @@ class SensorSource:
                 f"angles: the packets' vectors are turned against the points by {size}: echoes 10 m from a return are "
                 f"{plain(1000 * np.radians(off), 1)} cm off, and the errors of angles and of ranges "
                 "(range_error) hold it; compute points and vectors with the same mounting"
+            )
+        if "jump_m" in facts:
+            return (
+                f"range: the sensor's path by vectors jumps by {facts['jump_m']:.3g} m, as no aircraft does: in a part "
+                "of the strip points lie elsewhere (another datum of heights), or times do; errors of ranges hold it"
             )
         late, behind = (facts.get(name) or 0.0 for name in ("late_s", "behind_m"))
         if abs(behind) > max(MOUNTING * (self.distance or 0.0), 10.0 * (self.vectors_error or 0.0)):
@@ -752,6 +760,13 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     if np.mean(miss > LARGEST_MISS * distance) > MOST_MISS or above > LARGEST_MISS * distance:
         return None
     error, facts = float(np.sqrt(np.mean(squares) + motion + above**2)), _describe(found, path, rays)
+    wait, known = np.diff(path.time)[:, None], np.diff(path.time) <= path.gap
+    off = np.diff(path.xyz, axis=0) - 0.5 * wait * (path.velocity[1:] + path.velocity[:-1])
+    off = np.sqrt((off * off).sum(axis=1))[known]
+    most = 0.25 * STEADY * wait[known, 0] ** 2 + LEAST_JUMP + JUMP_SCATTER * (median(off) if len(off) else 0.0)
+    if np.any(off > most):
+        farthest = float(np.max(off[off > most]))
+        error, facts = float(np.hypot(error, farthest)), (*facts, ("jump_m", round(farthest, 2)))
     source = SensorSource(kind, path, distance=distance, error=error, facts=facts)
     if pairs is None:
         return source
