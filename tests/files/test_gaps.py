@@ -379,13 +379,16 @@ def test_packed_strips_are_read_in_the_order_that_is_smoother(tmp_path, rng, bit
 
 
 @pytest.mark.parametrize(
-    ("bits", "kind", "scale", "said"),
-    [(16, ">u2", 1, "bytes in the other order"), (32, ">u4", 1000, "bytes in the other order"),
-     (32, "<f4", 1e-3, "floating-point"), (32, "<u4", 1 << 20, ""), (16, "<u2", 16, "")],
+    ("bits", "kind", "level", "scale", "said"),
+    [(16, ">u2", 0, 3, "bytes in the other order"), (32, ">u4", 0, 1000, "bytes in the other order"),
+     (32, "<f4", 0, 1e-3, "floating-point"), (32, "<f4", 200, 1, "floating-point"), (32, "<u4", 0, 1 << 20, ""),
+     (32, "<u4", 900, 1 << 20, ""), (16, "<u2", 0, 16, ""), (16, "<u2", 0, 256, "")],
 )  # fmt: skip
-def test_samples_that_are_no_unsigned_integers_are_said(tmp_path, rng, bits, kind, scale, said):
-    raw = make_raw(60, n_samples=40, bits=bits)
-    raw.packets = (smooth_counts(rng, 60, 40, 11) * scale).astype(kind).tobytes()
+def test_samples_that_are_no_unsigned_integers_are_said(tmp_path, rng, bits, kind, level, scale, said):
+    """Not counts that were shifted up, with a mark of clipped ones, or that are as large as the bits of floats."""
+    raw, counts = make_raw(60, n_samples=40, bits=bits), level + smooth_counts(rng, 60, 40, 8)
+    clipped = (counts > 194) & (scale == 256)
+    raw.packets = np.where(clipped, 65_535, counts * scale).astype(kind).tobytes()
     with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
         assert [code for line, code in scan.doubts.items() if "seem to" in line] == ["packets"] * bool(said)
         assert said in " ".join(scan.warnings)
@@ -403,6 +406,16 @@ def test_fill_with_other_counts_is_said(tmp_path, rng, count, place):
         doubts = scan.doubts
     assert list(doubts.values()) == ["packets"] * (count not in (0, 255))
     assert all(f"30 of 60 packets that were looked at begin or end with equal counts of {count}," in k for k in doubts)
+
+
+def test_a_threshold_is_no_fill(tmp_path, rng):
+    """Where samples below a threshold have one count, echoes at an end of their packet step from it, too."""
+    raw, samples = make_raw(90, n_samples=60), smooth_counts(rng, 90, 60, 8)
+    samples[samples < 20] = 12
+    samples[::3] = np.where(np.arange(60) < 40, 12, np.arange(60))
+    raw.packets = samples.astype("u1").tobytes()
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert scan.doubts == {}
 
 
 def mirror(source, target):

@@ -505,7 +505,8 @@ changes at random is 256 times as large in the wrong place, and noise that hides
 FILL_STEP = 3
 """Counts from fill to the first recorded sample, in the middle of all packets; echoes and noise fade into a level."""
 FLOATS = 107 << 23, 157 << 23
-"""Bits of 2^-20 and 2^30 as 32-bit floating-point numbers: samples that are such lie there, over a factor of 2."""
+"""Bits of 2^-20 and 2^30 as 32-bit floating-point numbers: samples that are such lie there, and are whole numbers or
+lie over a factor of 2."""
 
 
 @frozen
@@ -702,12 +703,13 @@ def find_forms(
         tops = (stored.max_count, form.digitizer(stored, packed).max_count)
         votes.setdefault(index, _Votes()).add(samples, tops)
         for edge in (samples, samples[:, ::-1]):
-            # Where the noise is cut off at a threshold, both ends have the same count.
             flat = (edge[:, :LEAST_PADDING] == edge[:, :1]).all(axis=1) & (edge[:, -1] != edge[:, 0])
             values, many = np.unique(edge[flat, 0], return_counts=True)
             value = int(values[np.argmax(many)]) if many.max(initial=0) >= LEAST_VOTES else 0
             rows = edge[flat & (edge[:, 0] == value)].astype(np.int64)
-            if value not in (0, *tops):
+            # Where the noise is cut off at a threshold, most packets have the same count at both ends.
+            fills = len(rows) > np.count_nonzero((edge[:, 0] == value) & (edge[:, -1] == value))
+            if value not in (0, *tops) and fills:
                 first = rows[np.arange(len(rows)), np.argmax(rows != value, axis=1)]
                 if median(np.abs(first - value)) >= FILL_STEP:
                     wrong[index] = (
@@ -716,8 +718,8 @@ def find_forms(
                     )
         if packed or samples.dtype.itemsize == 1:
             continue
-        # Counts may be multiples of a power of two, which make low bytes 0.
-        step = int(np.bitwise_or.reduce(samples, axis=None))
+        # Counts may be multiples of a power of two, which make low bytes 0, but for the mark of clipped ones.
+        step = int(np.bitwise_or.reduce(samples[samples != tops[0]]))
         native, swapped = (
             float(np.abs(np.diff(counts.astype(np.float64), axis=1)).sum())
             for counts in (samples // samples.dtype.type(max(step & -step, 1)), samples.byteswap())
@@ -726,7 +728,11 @@ def find_forms(
         if samples.dtype.itemsize == 4 and samples.any():
             bare = samples[samples != 0] & np.uint32(2**31 - 1)  # without the sign
             least, most = quantile(bare, 0.01), quantile(bare, 0.99)
-            if FLOATS[0] < least < most - (1 << 23) < FLOATS[1] - (1 << 23):
+            # Integers that lie there by chance are no whole numbers with odd ones among them.
+            rest = np.remainder(bare[bare < FLOATS[1]].view(np.float32), 2)
+            whole = bool(np.isin(rest, (0, 1)).all() and rest.any())
+            wide = most - least > 1 << 23 and step % (1 << 20)  # counts of 12 bits that were shifted up are multiples
+            if FLOATS[0] < least and most < FLOATS[1] and (wide or whole):
                 seem = "be floating-point numbers"
         if seem:
             wrong[index] = (
