@@ -13,7 +13,7 @@ from scipy.linalg import toeplitz
 
 from wavebatch.kernels.elementary import exp, log, log1p, solve
 from wavebatch.kernels.fit import pulse_shape
-from wavebatch.kernels.fit.learn_pulse import Stack, _refine, _sum, refine_gaussians
+from wavebatch.kernels.fit.learn_pulse import Stack, _as_fit, _refine, _sum
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, find_rays, fit_rays, group_times, number_returns
@@ -371,7 +371,7 @@ def test_sums_of_gaussians_are_fitted_as_by_the_twin(rng, components, hard):
     stack = Stack(lag, value, np.full(len(lag), 1e-3))
     start = true[:components] * [1.0, 1.0, 1.1] + [0.0, 0.1, 0.0]
     start[:, 0] = np.maximum(start[:, 0], -0.2)
-    found = refine_gaussians(stack, start)
+    found = _as_fit(_refine(stack, np.ones(len(lag)), start.ravel()), 0.0)
     expected = naive_fit.fit_stack(stack, start, np.ones(len(lag)))
     weight, delay, _ = expected[0]
     assert found.datum == pytest.approx(delay, abs=1e-4)

@@ -23,7 +23,7 @@ COMPILED = {
     "render_pulses": ("render_pulses", "naive_describe.render"),
     "pair_differences": ("measure_covariance", "naive_signal.measure_covariance"),
     "judge_packets": ("judge_packets", "naive_packets.judge_packet"),
-    "interpolate_columns": ("interpolate", "np.interp"), "fit_stack": ("refine_gaussians", "naive_fit.fit_stack"),
+    "interpolate_columns": ("interpolate", "np.interp"), "fit_stack": ("_refine", "naive_fit.fit_stack"),
     "describe_echoes": ("describe_whole", "naive_fit.describe_whole"), "keep_echoes": ("keep_echoes", "naive_fit.keep"),
     "match_returns": ("match_returns", "naive.match_returns"),
     "weigh_fits": ("find_unexplained", "test_flags.missed"), "finish_echoes": ("finish_echoes", "test_flags.pairs"),

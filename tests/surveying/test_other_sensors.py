@@ -389,8 +389,8 @@ def test_rounds_of_all_echoes_go_on_while_each_surely_saves(n, seed, gaps, echoe
         is_worth = saved > 0.25 and before.exceeds(last) > 1.5
         if is_worth:
             explained = explain(taught, choose_pulse.bear(last.system, begin.change))
-            options = {"last": True, "counted": choose_pulse.COUNTED}
-            rounds.append(judge_pulse("", learn_jointly(taught, last.system, explained, begin.change, **options)))
+            system = learn_jointly(taught, last.system, explained, begin.change, choose_pulse.COUNTED)
+            rounds.append(judge_pulse("", system))
     lengths = [one.typical for one in rounds]
     assert len(rounds) == number and int(np.argmin(lengths[1:])) + 1 == taken
     found = choose_pulse._learn(taught, held, begin)

@@ -806,7 +806,7 @@ def test_echoes_do_not_hide_errors_of_their_pulse(seed):
     system = SystemPulse(sigma_ref=0.75, noise=ReceiverNoise(std=0.67, baseline=50.0))
     for turn in range(8):
         explained = explain(block, bear(system, 0.003 if turn else 0.01))
-        system = learn_jointly(block, system, explained, 0.003, last=turn > 0, counted=COUNTED)
+        system = learn_jointly(block, system, explained, 0.003, COUNTED)
     shifted = draw(system.components, x[:, None] - np.linspace(-1, 1, 401))
     wanted = draw(truth, x) / draw(truth, x).max()
     assert np.abs(shifted / shifted.max(axis=0) - wanted[:, None]).max(axis=0).min() < 0.03

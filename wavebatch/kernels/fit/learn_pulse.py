@@ -165,12 +165,6 @@ def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal:
         parameters = _refine(stack, weight, np.stack((*starts, sharper)), TRIAL_EVALUATIONS)
 
 
-def refine_gaussians(stack: Stack, components: np.ndarray) -> PulseFit:
-    """As many Gaussians as there are fitted to a stack, from (weight, delay, sigma) of each (c, 3) [samples]."""
-    parameters = _refine(stack, _weights(stack), components.ravel().astype(np.float64))
-    return _as_fit(parameters, float(np.sqrt(np.mean((stack.value - _sum(parameters, stack.lag)) ** 2))))
-
-
 def fit_skewed(stack: Stack, width: float) -> PulseFit:
     """The skewed pulse of section 0 fitted to the stack."""
     weight = _weights(stack)

@@ -292,9 +292,9 @@ def learn_alone(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
         With the new pulse. What it misses has become no further echo: each waveform has one.
     """
     part = thin_block(block, ALONE)
-    for last in (False, True):
+    for _ in range(2):
         explained = explain(part, bear(system, CHANGES[1]), max_echoes=1)
-        system = learn_jointly(part, system, explained, CHANGES[1], last=last)
+        system = learn_jointly(part, system, explained, CHANGES[1])
     return system
 
 
@@ -306,7 +306,7 @@ def _learn_from_all(block: WaveformBlock, best: Candidate) -> Candidate:
     if name not in ROUNDS:
         return best
     explained = explain(block, bear(best.system, best.change), **ROUNDS[name])
-    return replace(best, system=learn_jointly(block, best.system, explained, best.change, last=True))
+    return replace(best, system=learn_jointly(block, best.system, explained, best.change))
 
 
 def _find_gaussian(block: WaveformBlock, system: SystemPulse, change: float) -> SystemPulse:
@@ -330,7 +330,7 @@ def _learn(taught: WaveformBlock, judged: WaveformBlock, begin: Candidate) -> li
         if _save(last, before) <= LEAST_SAVED or before.exceeds(last) <= HINT:
             break
         explained = explain(taught, bear(last.system, begin.change))
-        system = learn_jointly(taught, last.system, explained, begin.change, last=True, counted=COUNTED)
+        system = learn_jointly(taught, last.system, explained, begin.change, COUNTED)
         rounds.append(_judge(judged, OF_ANY, system, CHANGES[1], known=False))
     return [*found[:-1], min(rounds[1:], key=lambda one: one.typical)]
 
@@ -341,13 +341,12 @@ def _list_rounds(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, 
     if not (system.components or system.kappa):
         yield OF_ALL, _find_gaussian(block, system, begin.change)
     for name, options in ROUNDS.items():
-        for last in (False, True):
-            change = begin.change if last else max(begin.change, FIRST_CHANGE)
+        for change in (max(begin.change, FIRST_CHANGE), begin.change):
             explained = explain(block, bear(system, change), **options)
             number = np.diff(explained.sums.first)
             if number[number <= MOST_ECHOES].sum() < ENOUGH_TO_LEARN:  # echoes of waveforms that say something of it
                 return
-            system = learn_jointly(block, system, explained, begin.change, last=last)
+            system = learn_jointly(block, system, explained, begin.change)
         yield name, system
 
 

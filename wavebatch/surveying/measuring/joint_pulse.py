@@ -12,7 +12,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import gather_pulse
-from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, Stack, fit_gaussians, refine_gaussians
+from wavebatch.kernels.fit.learn_pulse import Stack, fit_gaussians
 from wavebatch.stages.pulse_tables import shape_limits
 from wavebatch.surveying.measuring.judge import Explained, find_own_width, sample_noise
 from wavebatch.surveying.measuring.learn_pulse import with_fit
@@ -52,7 +52,7 @@ ALIKE = 1.1
 
 
 def learn_jointly(
-    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float, *, last: bool, counted: float = 1.0
+    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float, counted: float = 1.0
 ) -> SystemPulse:
     """Learn the pulse that describes all waveforms best, given where their echoes are.
 
@@ -65,8 +65,6 @@ def learn_jointly(
         The block decomposed with it.
     change : float
         Of the pulse from shot to shot, as a share of its amplitude.
-    last : bool
-        Whether the pulse is final; else it only has to separate echoes, and few Gaussians serve.
     counted : float
         Weight of errors of the pulse that amplitudes and times of the echoes may absorb.
 
@@ -88,10 +86,7 @@ def learn_jointly(
     if not len(half):  # of steps and other signal that is no echo nothing is learned
         return system
     width = float(half[-1] - half[0]) / FWHM_PER_SIGMA
-    if len(system.components) > 1 and not last:
-        fits = [refine_gaussians(stack, np.array(system.components) / [1, spacing, spacing])]
-    else:
-        fits = fit_gaussians(stack, width, MOST_COMPONENTS if last else 3)
+    fits = fit_gaussians(stack, width)
     missed = [float(np.mean((fit.draw(stack.lag) - stack.value) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
