@@ -235,11 +235,18 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
 
 
 def _survey(
-    block: WaveformBlock, system: SystemPulse, *, learn: bool, errors: bool, guessed: bool | None = None
+    block: WaveformBlock,
+    system: SystemPulse,
+    *,
+    learn: bool,
+    errors: bool,
+    guessed: bool | None = None,
+    shown: float = 1.0,
 ) -> Survey:
     """As survey_block, from noise and width by `clean_sample`; once more where noise grows with the signal.
 
     guessed: whether the growth of noise in `system` is a guess, or False where fits showed it; None before both.
+    shown: share of it that fits without it showed: at the limit of chance tiles would have none of it, or all.
     """
     first, figures, repeated, lowered, fixed_share = system, Figures(), [], 0.0, 0.0
     candidates: tuple[Tried, ...] = ()
@@ -281,10 +288,10 @@ def _survey(
                 system = replace(system, noise=replace(noise, gain=first.noise.gain))
         borne = bear(system, choice.best.change)
         echoes = decompose_sample(part, borne)
-        system = measure_residuals(part, system, echoes)
+        system, share = measure_residuals(part, system, echoes, shown)
         if guessed or (guessed is None and system.noise.gain > 0):
-            again = measure_again(block, first, system.noise.gain)
-            return _survey(block, again, learn=learn, errors=errors, guessed=False)
+            again, shown = measure_again(block, first, system.noise.gain), 1.0 if guessed else share
+            return _survey(block, again, learn=learn, errors=errors, guessed=False, shown=shown)
         noise, looked = lower_noise(part, replace(borne, noise=system.noise))
         if noise is not system.noise:
             lowered = system.noise.std

@@ -146,7 +146,9 @@ def describe_own(system: SystemPulse, echoes: EchoTable, spacing: float) -> tupl
     return shape, model_parameters(shape, limits, whole.astype(np.float64))
 
 
-def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+def measure_residuals(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, shown: float = 1.0
+) -> tuple[SystemPulse, float]:
     """The system with the noise that fits leave in weak echoes, where counts hardly scatter, and its growth.
 
     Parameters
@@ -155,6 +157,14 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     system : SystemPulse
     echoes : EchoTable
         As decomposed with this system.
+    shown : float
+        Share of the growth to take: what fits before them showed, by degrees.
+
+    Returns
+    -------
+    system : SystemPulse
+    shown : float
+        Share of its growth that these fits show, 0 where it could be chance.
 
     Notes
     -----
@@ -170,7 +180,7 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
         again = adaptive(part, pooled_noise(part, white), white, replace(alone, waveform=rows), max_echoes=1)
         alone = replace(again, waveform=alone.waveform[again.waveform])
     if len(alone) < ENOUGH_TO_LEARN:
-        return system
+        return system, 0.0
     time, width = alone.time / block.spacing, alone.sigma / block.spacing
     rows = np.arange(len(alone), dtype=np.int32)
     part = block.rows(alone.waveform)
@@ -188,8 +198,8 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     sample = kinds["quiet"] or std
     coloured = std > COLOURED * sample
     steep = bool(2 * system.noise.gain * quantile(alone.amplitude, 0.9) > MANIFOLD * std**2) and not coloured
-    gain = _noise_gain(residual, model, lag, std, coloured, steep=steep, fitted=True)
-    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=gain))
+    gain, share = _noise_gain(residual, model, lag, std, coloured, steep=steep, fitted=True)
+    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=shown * gain)), share
 
 
 def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
@@ -212,7 +222,7 @@ def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     lag = (np.arange(model.shape[1]) - echoes.time[:, None] / block.spacing) / (echoes.sigma[:, None] / block.spacing)
     std = noise.quiet * np.sqrt(left)
     # The fit takes away nothing of such differences.
-    gain = _noise_gain(fine, signal, lag, std, False, steep=True, fitted=False) * (noise.std / std) ** 2
+    gain = _noise_gain(fine, signal, lag, std, False, steep=True, fitted=False)[0] * (noise.std / std) ** 2
     return gain if gain * quantile(echoes.amplitude, 0.9) > MANIFOLD * noise.std**2 else 0.0
 
 
@@ -309,8 +319,8 @@ def _find_leverage(lag: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.
 
 def _noise_gain(
     residual: np.ndarray, model: np.ndarray, lag: np.ndarray, std: float, coloured: bool, *, steep: bool, fitted: bool
-) -> float:
-    """Growth of the variance per count of signal, 0 where it could be chance (H12).
+) -> tuple[float, float]:
+    """Growth of the variance per count of signal, 0 where it could be chance (H12), and the share that is shown.
 
     lag: after the echo's centre, in widths. steep: if it is one of MANIFOLD. fitted: residuals are those of fits.
     """
@@ -329,7 +339,7 @@ def _noise_gain(
     # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
     signal = (signal * (1 - 2 * taken) + brought) / (1 - taken)
     if len(signal) < ENOUGH_TO_GROW:
-        return 0.0
+        return 0.0, 0.0
     order = np.argsort(signal)
     signal, squared = signal[order], squared[order]
     edges = quantiles(signal, np.linspace(0, 1, 13))
@@ -354,5 +364,5 @@ def _noise_gain(
     rest = share * fits[1][0][0] + (1 - share) * fits[3][0][0]
     if coloured and gain > 0:
         gain *= std**2 / np.clip(rest, std**2 / MOST_COLOURED, std**2)
-    gain = float(gain * np.clip((sigma - 3) / 3, 0.0, 1.0))
-    return gain if gain * edges[-2] > 0.3 * std**2 else 0.0
+    shown = float(np.clip((sigma - 3) / 3, 0.0, 1.0))
+    return (float(gain * shown), shown) if gain * shown * edges[-2] > 0.3 * std**2 else (0.0, 0.0)
