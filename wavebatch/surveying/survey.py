@@ -25,15 +25,20 @@ from wavebatch.surveying.measuring.misfit import (
     LEAST_MISFIT,
     MISFIT_PEAK,
     MOST_FAINT,
+    MOST_LACKED,
+    MOST_MERGED,
+    MOST_MISFIT,
+    MOST_REPEATED,
     STEP_OF_MISFITS,
     cover_faint,
     cover_fits,
-    cover_repeated,
+    cover_share,
     find_parts,
     limit_faint,
     measure_beside,
     measure_tail,
     share_fixed,
+    share_merged,
     share_repeated,
     suspect_pairs,
 )
@@ -326,7 +331,8 @@ def _survey(
             echoes = decompose_sample(part, system)
         repeated_share = share_repeated(echoes, system.sigma_ref)
         if repeated_share > MOST_DOUBTED:
-            system, echoes = cover_repeated(part, system, echoes)
+            system, echoes = cover_share(part, system, echoes, share_repeated, MOST_REPEATED, MOST_LACKED)
+        system, echoes = cover_share(part, system, echoes, share_merged, MOST_MERGED, MOST_MISFIT)
         covered = cover_faint(system, echoes, mirror.beside / max(mirror.echoes, 1))  # of another sample
         if covered is not system:
             system, echoes = covered, decompose_sample(part, covered)

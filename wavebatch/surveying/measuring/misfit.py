@@ -5,7 +5,7 @@ Growth and detection ask more of an echo beside a strong one by these figures (d
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -131,6 +131,11 @@ SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
 MOST_REPEATED, MOST_LACKED = 0.05, 0.016
 """Share of the echoes that may repeat beside stronger ones once a misfit covers what does: of real strips .03 do. And
 the largest misfit that does: more is a second target, as rows of crops have, and no error of six Gaussians."""
+
+NOT_TOLD, MOST_MERGED = 0.5, 0.01
+"""Distance [system widths] below which no two echoes of less than thousands of noises are told apart, by any fit: with
+free widths they differ from one by the cube of the distance. And share of the echoes that may be so near: in simulated
+strips with the right pulse, of any scene, up to .009 are."""
 
 MOST_HAVE, FIXED, ONE_PLACE, EQUAL, TRIGGERED = 0.5, 4.0, 1.2, 0.12, 12**-0.5
 """Share of the waveforms that have an echo at one sample, and at least one elsewhere, where the receiver makes the
@@ -272,10 +277,15 @@ def suspect_pairs(echoes: EchoTable, width: float) -> bool:
     return bool(proven > MOST_PROVEN * apart / 2)
 
 
-def cover_repeated(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable
+def cover_share(
+    block: WaveformBlock,
+    system: SystemPulse,
+    echoes: EchoTable,
+    share: Callable[[EchoTable, float], float],
+    allowed: float,
+    most: float,
 ) -> tuple[SystemPulse, EchoTable]:
-    """Find the least misfit with which no more echoes than MOST_REPEATED repeat beside stronger ones.
+    """Find the least misfit with which no larger share of the echoes is doubtful than allowed.
 
     Parameters
     ----------
@@ -283,6 +293,11 @@ def cover_repeated(
     system : SystemPulse
     echoes : EchoTable
         The block decomposed with it.
+    share : callable
+        `share_repeated` or `share_merged`.
+    allowed : float
+    most : float
+        The largest misfit that is tried.
 
     Returns
     -------
@@ -296,12 +311,22 @@ def cover_repeated(
     describe that far shorter, and fits miss nothing.
     """
     higher, found = system, echoes
-    while share_repeated(found, system.sigma_ref) > MOST_REPEATED:
-        if higher.misfit >= MOST_LACKED:
+    while share(found, system.sigma_ref) > allowed:
+        if higher.misfit >= most:
             return system, echoes
-        higher = replace(higher, misfit=min(max(STEP_OF_MISFITS**2 * higher.misfit, LEAST_MISFIT), MOST_LACKED))
+        higher = replace(higher, misfit=min(max(STEP_OF_MISFITS**2 * higher.misfit, LEAST_MISFIT), most))
         found = decompose_sample(block, higher)
     return higher, found
+
+
+def share_merged(echoes: EchoTable, width: float) -> float:
+    """Share of the echoes, less what chance adds to MOST_MERGED, that lie nearer to another one than two can be told.
+
+    A pulse that changes from shot to shot, or that is stretched where its model is made rounder, is described by two.
+    """
+    row, _, distance = _list_distances(echoes, width)
+    number = len(distinct(row[distance < NOT_TOLD]))
+    return max(number - SURE * float(np.sqrt(number)), 0.0) / max(len(echoes), 1)
 
 
 def share_repeated(echoes: EchoTable, width: float) -> float:
