@@ -15,7 +15,14 @@ from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring.learn_pulse import find_clear
-from wavebatch.surveying.measuring.misfit import cover_fits, find_parts, measure_tail, share_repeated, summarize_shares
+from wavebatch.surveying.measuring.misfit import (
+    cover_fits,
+    find_parts,
+    measure_tail,
+    share_merged,
+    share_repeated,
+    summarize_shares,
+)
 from wavebatch.surveying.systems.known_systems import compare_pulses
 
 
@@ -176,6 +183,15 @@ def test_echoes_beside_stronger_ones_at_one_lag_and_ratio_are_counted_beyond_cha
     columns = (np.concatenate(pair) for pair in ((np.full(400, 30.0), 30 + lag), (np.full(400, 100.0), height)))
     echoes = EchoTable.build(np.tile(np.arange(400), 2), *columns, np.full(800, 2.0))
     assert share_repeated(echoes, 2.0) == pytest.approx(share, abs=0.03)
+
+
+@pytest.mark.parametrize(("number", "share"), [(3, 0.0), (50, 0.07), (400, 0.92)])
+def test_echoes_nearer_than_two_can_be_told_are_counted_beyond_chance(number, share):
+    """Half a width of the pulse is too near for two echoes, whatever their heights; .6 is not."""
+    lag = np.where(np.arange(400) < number, 0.8, 1.2)
+    time = np.stack([np.full(400, 30.0), 30 + lag], axis=1).ravel()
+    echoes = EchoTable.build(np.repeat(np.arange(400), 2), time, np.full(800, 90.0), np.full(800, 2.0))
+    assert share_merged(echoes, 2.0) == pytest.approx(share, abs=0.03)
 
 
 @pytest.mark.parametrize(

@@ -154,6 +154,17 @@ def test_noise_that_grows_most_where_the_fit_takes_most_is_put_back(rng, width, 
     assert least < found.system.noise.gain < 0.22
 
 
+@pytest.mark.parametrize(("n", "seed", "most"), [(120, 4, 0.02), (150, 8, 0.015), (240, 1, 0.06)])
+def test_growth_of_noise_at_the_limit_of_chance_is_taken_by_degrees(n, seed, most):
+    """Fits without any growth show a quarter of it, those that know it all: halves of Optech had none of it, or all."""
+    rng, x = np.random.default_rng(seed), np.arange(80)
+    time, height = rng.uniform(20, 60, (n, 1)), np.exp(rng.uniform(np.log(50), np.log(1500), (n, 1)))
+    light = height * np.exp(-0.5 * ((x - time) / np.where(x < time, 2.0, 3.0)) ** 2)
+    samples = np.rint(100 + light + np.sqrt(4 + 0.04 * light) * rng.standard_normal((n, 80)))
+    gain = survey_block(WaveformBlock.from_samples(samples.astype(np.uint16))).system.noise.gain
+    assert 0.4 * most < gain < most
+
+
 def test_any_waveforms_can_be_surveyed(rng):
     noise = rng.integers(0, 256, (50, 30)).astype(np.uint8)
     for samples in (noise, noise[:1], noise[:, :3], np.full((FIRST_LOOK // 12 + 9, 12), 255, np.uint8)):

@@ -158,7 +158,7 @@ def measure_residuals(
     echoes : EchoTable
         As decomposed with this system.
     shown : float
-        Share of the growth to take: what fits before them showed, by degrees.
+        Most of the growth to take, as a share: what fits before them showed, by degrees.
 
     Returns
     -------
@@ -198,8 +198,8 @@ def measure_residuals(
     sample = kinds["quiet"] or std
     coloured = std > COLOURED * sample
     steep = bool(2 * system.noise.gain * quantile(alone.amplitude, 0.9) > MANIFOLD * std**2) and not coloured
-    gain, share = _noise_gain(residual, model, lag, std, coloured, steep=steep, fitted=True)
-    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=shown * gain)), share
+    gain, share = _noise_gain(residual, model, lag, std, coloured, steep=steep, fitted=True, shown=shown)
+    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=gain)), share
 
 
 def guess_growth(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
@@ -318,11 +318,20 @@ def _find_leverage(lag: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _noise_gain(
-    residual: np.ndarray, model: np.ndarray, lag: np.ndarray, std: float, coloured: bool, *, steep: bool, fitted: bool
+    residual: np.ndarray,
+    model: np.ndarray,
+    lag: np.ndarray,
+    std: float,
+    coloured: bool,
+    *,
+    steep: bool,
+    fitted: bool,
+    shown: float = 1.0,
 ) -> tuple[float, float]:
     """Growth of the variance per count of signal, 0 where it could be chance (H12), and the share that is shown.
 
     lag: after the echo's centre, in widths. steep: if it is one of MANIFOLD. fitted: residuals are those of fits.
+    shown: most of the share.
     """
     core = np.abs(lag) < GROWTH_REACH
     taken, brought = _find_leverage(lag, model) if fitted else np.zeros((2, *lag.shape))
@@ -364,5 +373,5 @@ def _noise_gain(
     rest = share * fits[1][0][0] + (1 - share) * fits[3][0][0]
     if coloured and gain > 0:
         gain *= std**2 / np.clip(rest, std**2 / MOST_COLOURED, std**2)
-    shown = float(np.clip((sigma - 3) / 3, 0.0, 1.0))
+    shown = float(np.clip((sigma - 3) / 3, 0.0, shown))
     return (float(gain * shown), shown) if gain * shown * edges[-2] > 0.3 * std**2 else (0.0, 0.0)
