@@ -132,10 +132,11 @@ MOST_REPEATED, MOST_LACKED = 0.05, 0.016
 """Share of the echoes that may repeat beside stronger ones once a misfit covers what does: of real strips .03 do. And
 the largest misfit that does: more is a second target, as rows of crops have, and no error of six Gaussians."""
 
-NOT_TOLD, MOST_MERGED = 0.5, 0.01
+NOT_TOLD, AS_NARROW, MOST_MERGED = 0.5, 1.25, 0.01
 """Distance [system widths] below which no two echoes of less than thousands of noises are told apart, by any fit: with
-free widths they differ from one by the cube of the distance. And share of the echoes that may be so near: in simulated
-strips with the right pulse, of any scene, up to .009 are."""
+free widths they differ from one by the cube of the distance. Width of either, over the system's, from which they are
+targets of any shape: plants in a large footprint, 1.6 to 3 on LVIS. And share of the echoes that may be so near: in
+simulated strips with the right pulse, of any scene, up to .009 are."""
 
 MOST_HAVE, FIXED, ONE_PLACE, EQUAL, TRIGGERED = 0.5, 4.0, 1.2, 0.12, 12**-0.5
 """Share of the waveforms that have an echo at one sample, and at least one elsewhere, where the receiver makes the
@@ -320,12 +321,13 @@ def cover_share(
 
 
 def share_merged(echoes: EchoTable, width: float) -> float:
-    """Share of the echoes, less what chance adds to MOST_MERGED, that lie nearer to another one than two can be told.
+    """Share of echoes, beyond chance, that lie nearer to another one than two can be told, both as narrow as a pulse.
 
     A pulse that changes from shot to shot, or that is stretched where its model is made rounder, is described by two.
     """
-    row, _, distance = _list_distances(echoes, width)
-    number = len(distinct(row[distance < NOT_TOLD]))
+    row, other, distance = _list_distances(echoes, width)
+    near = (distance < NOT_TOLD) & (np.maximum(echoes.sigma[row], echoes.sigma[other]) < AS_NARROW * width)
+    number = len(distinct(row[near]))
     return max(number - SURE * float(np.sqrt(number)), 0.0) / max(len(echoes), 1)
 
 
