@@ -13,6 +13,7 @@ from commands import run_command as run
 from helpers_scenes import make_block, make_scene
 from hypothesis import given
 from hypothesis import strategies as st
+from stranger_strips import make_strip
 from writer_tools import data_file
 
 from wavebatch.batch.counts import RunReport
@@ -322,6 +323,13 @@ def test_noise_that_was_edited_is_doubted(folder, factor, doubted):
     with StripReader(folder / "flat.las") as reader, reader.scan() as scan:
         found = find_contradiction(reader, scan, replace(saved, system=replace(saved.system, noise=noise)))
     assert ("its noise is" in found[0]) == doubted and not found[1]
+
+
+def test_coloured_noise_is_that_of_its_own_survey(tmp_path):
+    """A pulse sees 3.4 times what its samples scatter by: three of 300 simulated strips contradicted their survey."""
+    path = make_strip(6736, tmp_path)
+    with StripReader(path) as reader, reader.scan() as scan:
+        assert find_contradiction(reader, scan, survey(path)) == ("", False)
 
 
 @pytest.mark.slow

@@ -422,10 +422,10 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     look = look_at(blocks, survey.system)
     if look is None:
         return "", False
-    # That of a survey with figures is of its strip, unless somebody has edited it.
+    # Of coloured noise a pulse sees four times what samples scatter by. Only one that was edited is of no kind.
     noise, seen, other = survey.system.noise, look.level.std, ""
-    noises = [noise.std, *(value for value in noise.by_kind.values() if value > 0 and figures.look is None)]
-    if not min(noises) / LARGEST_NOISE < seen < max(noises) * LARGEST_NOISE:
+    kinds = [value for value in noise.by_kind.values() if value > 0] or [noise.std]
+    if not all(min(kinds) / LARGEST_NOISE < one < max(kinds) * LARGEST_NOISE for one in (seen, noise.std)):
         other = f"its noise is {seen:.2f} DN, that of the survey {noise.std:.2f}"
     if figures.look is None:
         reason = other or _compare_system(look, survey)
