@@ -424,8 +424,8 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
         return "", False
     # Of coloured noise a pulse sees four times what samples scatter by. Only one that was edited is of no kind.
     noise, seen, other = survey.system.noise, look.level.std, ""
-    kinds = [value for value in noise.by_kind.values() if value > 0] or [noise.std]
-    if not all(min(kinds) / LARGEST_NOISE < one < max(kinds) * LARGEST_NOISE for one in (seen, noise.std)):
+    noises = [value for value in noise.by_kind.values() if value > 0] or [noise.std]
+    if not all(min(noises) / LARGEST_NOISE < one < max(noises) * LARGEST_NOISE for one in (seen, noise.std)):
         other = f"its noise is {seen:.2f} DN, that of the survey {noise.std:.2f}"
     if figures.look is None:
         reason = other or _compare_system(look, survey)
