@@ -368,7 +368,7 @@ def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
     other = scene + 0.2 * np.where(np.arange(10) % 2, 1.0, -1.0)
     alike, unlike = compare_scenes(scene, scene + 0.02, 0.0), compare_scenes(scene, other, 0.0)
     assert alike.chance < 0.1 and alike.error < 0.02
-    assert unlike.chance < 0.25 and 0.07 < unlike.error < 0.1
+    assert unlike.chance < 0.25 and 0.1 < unlike.error < 0.15
     for factor in (0.7, 0.8, 1.25, 1.4):
         change = np.log(factor)
         assert compare_scenes(scene + change, scene, 0.0).chance > 0.8
@@ -380,14 +380,18 @@ def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
     assert compare_scenes(scene + 0.3, scene).error > 0.25
 
 
-@pytest.mark.parametrize("spread", [0.05, 0.3])
-def test_the_error_is_one_standard_deviation_of_what_light_may_hide(rng, spread):
-    """Drawn as the assumptions say: squares of errors were 1.4 times those of changes."""
-    changed, gain = rng.random(4000) < 0.3, rng.random(4000) < 0.5
-    change = changed * rng.normal(0.0, 0.35, 4000)
-    seen = zip(change + spread * rng.normal(size=4000), change * gain + 0.1 * rng.normal(size=4000), strict=True)
-    stated = np.array([setting.weigh_change(light, spread, noise, chance=0.3).error for light, noise in seen])
-    assert np.mean(change**2) / np.mean(stated**2) == pytest.approx(1.0, abs=0.1)
+@pytest.mark.parametrize("factor", [0.65, 0.8, 1.25, 1.6])
+def test_energies_over_another_landscape_are_within_the_error_half_of_the_time(rng, factor):
+    """7, 15, 32 and 26 % were, with the root mean square over strips of which most had not changed."""
+    scene, apart = np.linspace(15.0, 17.0, 10), 0.08 * np.where(np.arange(10) % 2, 1.0, -1.0)
+    known = Calibration(2e-8, 0.03, channels=(ChannelConstant(1, 0, 2e-8, 0.03, scene=tuple(scene)),))
+    growth: dict[float, list[float]] = {1.0: [], factor: []}
+    for surfaces in rng.normal(0.0, 0.3, 1000):
+        for energy in growth:
+            seen = tuple(scene + apart + surfaces + np.log(energy))
+            found = Setting(None, {}, {(1, 0): seen}, {}, (1.0, 0.0), NO_CHANGE, None)
+            growth[energy].append(compare_setting(known, found, SystemPulse(2.0))[0])
+    assert np.mean(np.array(growth[factor]) > abs(1.0 - 1.0 / factor)) > 0.4 and np.median(growth[1.0]) < 0.2
 
 
 def test_another_landscape_is_not_another_gain():
@@ -598,7 +602,7 @@ def test_a_hillside_or_a_valley_is_no_light_that_is_uneven(rng, place, valley):
     rows = np.stack([y, light, x + place, y + place, away[2], -away[2] / distance, np.full(4000, place), y + place,
                      distance])  # fmt: skip
     sides = partial(setting._find_sides, place=rows[2:4], chance=0.3)
-    assert all(one.chance < 0.2 for one in sides(*setting._level(rows, (1.0, 0.0))))  # 0.3 before light is seen
+    assert all(one.chance < 0.1 for one in sides(*setting._level(rows, (1.0, 0.0))))
     rows[1] *= np.exp(0.0005 * np.abs(x) if valley else 0.0005 * x)
     found = sides(*setting._level(rows, (1.0, 0.0)))[valley]
     assert found.shift == pytest.approx(0.05 if valley else 0.1, abs=0.02)
@@ -635,7 +639,7 @@ def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, ca
     assert "second half" not in run(calibrated, tmp_path / "out", tmp_path / "even.las")
     assert "the second half of the strip is -16 % brighter" in run(calibrated, tmp_path / "out", tmp_path / "fades.las")
     stated = state_error(tmp_path / "out" / "fades.laz")
-    assert 0.14 < stated < 0.3
+    assert 0.17 < stated < 0.45
 
 
 FAST = Sensor(light=LIGHT, rate=250_000.0, line_rate=800.0, half_angle=20.0, height=911.0)
@@ -855,7 +859,7 @@ def test_a_chance_of_zero_adds_nothing_for_what_scenes_do_not_show():
         known = Calibration(2e-8, 0.03, 0.22, channels=(row,), change_chance=chance)
         growth, lines, notes = compare_setting(known, found, SystemPulse(2.0))
         said.append((growth, len(lines), "by an assumed chance of 30% (change_chance)" in "".join(notes)))
-    assert 0.1 < said[0][0] < 0.15 and said[0][1:] == (0, True) and said[1] == (0.0, 0, False)
+    assert 0.15 < said[0][0] < 0.22 and said[0][1:] == (0, True) and said[1] == (0.0, 0, False)
 
 
 def test_other_surfaces_at_two_wavelengths_are_no_constants_of_another_channel(rng):
@@ -1073,7 +1077,7 @@ def test_other_air_within_a_day_has_an_error_that_holds(tmp_path, calibrated, ai
         off, inside = compare_fields(cloud, cloud["level_reflectance"], 2.0)
         off = off[inside]
         stated = state_error(cloud)
-        assert abs(np.median(off)) > 0.03 and np.mean(np.abs(off) < stated) > 0.6 and stated < 0.12
+        assert abs(np.median(off)) > 0.03 and np.mean(np.abs(off) < stated) > 0.6 and stated < 0.15
 
 
 @pytest.mark.slow

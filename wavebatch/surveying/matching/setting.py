@@ -64,7 +64,8 @@ CHANGES = ((1.0, 0.0), (1.0, 1.0))
 `Calibration.change_chance` before light and noise are seen."""
 
 LIKELY = 0.5
-"""Chance from which another gain or energy is named, and all of what shows is in the error."""
+"""Chance from which another gain or energy is named. From there on the error is that of a change; below, the square is
+less by the chance over this one, so that both meet: by the chance alone it would hold few of the changes there are."""
 
 ZONE_PARTS = 8
 """Parts of a strip whose bend is measured: their scatter tells ground from a wrong pulse zone."""
@@ -143,7 +144,7 @@ class Change(NamedTuple):
     chance: float
     """Of another gain or energy, from 0 to 1."""
     error: float
-    """Standard deviation of what that, or nothing, does to the light (logarithm), as far as the light shows it."""
+    """Root mean square of the logarithm of that change, as far as the light shows it, from LIKELY on; less below."""
     spread: float = np.inf
     """How much surfaces change the ratio (standard deviation)."""
     is_uneven: bool = False
@@ -231,7 +232,9 @@ def weigh_change(
         chances.append(prior * np.exp(-0.5 * seen @ inverse @ seen) * np.sqrt(np.linalg.det(inverse)))
         squares.append((light[0] @ inverse @ seen) ** 2 + light[0, 0] - light[0] @ inverse @ light[0])
     share = np.array(chances) / max(sum(chances), 1e-300)
-    return Change(shift, float(1.0 - share[0]), float(np.sqrt(share @ squares)), spread)
+    changed = float(1.0 - share[0])
+    share[1:] /= max(changed, LIKELY)
+    return Change(shift, changed, float(np.sqrt(share @ squares)), spread)
 
 
 def compare_scenes(
@@ -360,7 +363,7 @@ def _level(rows: np.ndarray, right: tuple[float, float]) -> tuple[np.ndarray, np
 
 def _find_sides(light: np.ndarray, across: np.ndarray, place: np.ndarray, *, chance: float) -> tuple[Change, ...]:
     """How light, as from `_level`, grows from one half of the swath to the other, and from its middle to both edges."""
-    prior: Any = {"chance": chance, "most": USUAL_SIDES}
+    prior: Any = {"chance": chance / 2, "most": USUAL_SIDES}
     found = (_find_fading(one, light, place, **prior) for one in (across, np.abs(across)))
     unseen = weigh_change(0.0, 10.0 * USUAL_SIDES, **prior)  # too few waveforms show nothing
     return tuple(unseen if one is NO_CHANGE else one for one in found)

@@ -61,9 +61,12 @@ HIDDEN = 0.05
 SIDES = ("from half to half of the swath", "between its middle and its edges")
 """Of `Setting.sides`."""
 
+FROM_START = 2.0 / 3.0**0.5
+"""Root mean square over a strip of light that changes evenly from its start, over the change from half to half."""
+
 ANYWHERE = (2.0 / 3.0) ** 0.5
-"""Root mean square of what even growth along a strip, or across a swath, changes between two places anywhere in it, a
-target's and an echo's, over the growth from half to half."""
+"""Root mean square of what even growth across a swath changes between two places anywhere in it, a target's and an
+echo's, over the growth from half to half."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -186,8 +189,8 @@ def compare_setting(
         if not shows:
             continue
         # What common ground shows is in the error, whatever changed it, with half of what it is uncertain: 68 % of the
-        # changes that may have made it are smaller.
-        seen = bool(ground or change.chance > settings.LIKELY)
+        # changes that may have made it are smaller. So is all of what other scenes show, where surfaces mostly do less.
+        seen = bool(ground or change.chance > settings.LIKELY or abs(change.shift) > change.spread and chance)
         more = math.expm1(max(change.error, (abs(change.shift) + 0.5 * change.spread * bool(ground)) * seen))
         growth, unseen = max(growth, more), 0.0
         step = math.log(energy or 1.0)
@@ -265,13 +268,13 @@ def judge_fading(
             "by it; calibrate shorter strips"
         ], []
     if fades.chance > settings.LIKELY:
-        growth = math.expm1(ANYWHERE * abs(fades.shift))
+        growth = math.expm1(FROM_START * abs(fades.shift))
         return growth, [
             f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
             "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
             f"{100 * growth:.0f} %; calibrate shorter strips"
         ], []
-    growth = math.expm1(ANYWHERE * fades.error)
+    growth = math.expm1(FROM_START * fades.error)
     if growth < HIDDEN or not other and len(calibration.strips) > 1:
         return 0.0, [], []
     return growth, [], [
