@@ -133,9 +133,9 @@ class WrittenColumn:
     def encode(self, values: np.ndarray) -> np.ndarray:
         """Return the stored values (m,) of physical `values` (m,); values that are not finite become no-data.
 
-        Scaled values outside the stored type become its nearest value that is not no-data.
+        Values outside the stored type become its nearest value that is not no-data. Integers that are no-data stay so.
         """
-        dtype, no_data = self.record.dtype, self.record.no_data
+        dtype, no_data, whole = self.record.dtype, self.record.no_data, values.dtype.kind in "ui"
         if dtype.kind in "ui" and values.dtype == dtype:
             return values
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -146,9 +146,9 @@ class WrittenColumn:
                 stored = values.astype(dtype)
                 return stored if no_data is None else np.where(np.isfinite(stored), stored, no_data[0])
             stored = np.rint(values / (self.naming.scale or 1.0))
-        good = np.isfinite(stored)
         limits = np.iinfo(dtype)
         empty = 0 if no_data is None else int(no_data[0])
+        good = np.isfinite(stored) & (values != empty if whole else True)
         least, largest = limits.min + (empty == limits.min), limits.max - (empty == limits.max)
         return np.where(good, np.clip(np.where(good, stored, 0.0), least, largest), empty).astype(dtype)
 
