@@ -206,8 +206,10 @@ def compare_setting(
                 "that scale, or --energy none"
             )
         elif change.chance <= settings.LIKELY and more > HIDDEN:
-            brighter = f"{100 * math.expm1(change.shift):+.0f} % brighter, which its scatter and moisture may do"
-            known = f"ground in common {which} is {brighter}" if ground else f"surfaces {which} differ, none is common"
+            brighter = f"{100 * math.expm1(change.shift):+.0f} % brighter"
+            known = f"surfaces {which} are {brighter}, none is common"
+            if ground:
+                known = f"ground in common {which} is {brighter}, which its scatter and moisture may do"
             notes.append(
                 f"calibration: {known}, so that another energy under the same header, or other air, would not show: "
                 f"{100 * more:.0f} % of error hold it, by an assumed chance of {chance:.0%} (change_chance); calibrate "
