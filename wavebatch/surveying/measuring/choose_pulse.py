@@ -125,8 +125,8 @@ COUNTED = 0.3
 """Weight of errors of the pulse that echoes may absorb in these."""
 
 FIRST_CHANGE = 0.01
-"""Change of the pulse from shot to shot, at least, in the first round of each: what a pulse of few Gaussians misses
-must not become echoes, which would keep the shoulders of the next one as wrong."""
+"""Change of the pulse from shot to shot, at least, in the first round of each: what the pulse of a stack misses must
+not become echoes, which would keep the shoulders of the next one as wrong."""
 
 FALSE_QUIET = 0.0075
 """Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
