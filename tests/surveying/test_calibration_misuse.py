@@ -533,7 +533,7 @@ def test_a_log_of_another_scale_is_no_other_laser(energy, wrong):
     """Energies 1.8 times too large over a like landscape: values were 44 % too small, with 33 % stated."""
     scene = np.linspace(15.0, 17.0, 10)
     known = Calibration(2e-8, 0.03, channels=(ChannelConstant(1, 0, 2e-8, 0.03, scene=tuple(scene)),))
-    other = scene + 0.005 * np.where(np.arange(10) % 2, 1.0, -1.0) - np.log(energy) * wrong
+    other = scene + 0.03 * np.where(np.arange(10) % 2, 1.0, -1.0) - np.log(energy) * wrong
     found = Setting(None, {}, {(1, 0): tuple(other)}, {}, (1.0, 0.0), NO_CHANGE, None)
     growth, lines, _ = compare_setting(known, found, SystemPulse(2.0), 0.0, energy)
     assert ("is it of another scale" in "".join(lines)) == (wrong and energy != 1.0)
