@@ -62,7 +62,8 @@ def _read_packets(path):
                     a = table.attributes
                     echoes[owner] = [
                         {"time": table.time[k], "xyz": [a[c][k] for c in "xyz"], "point": int(a["point"][k]),
-                         "amplitude": a["amplitude"][k], "flags": int(table.flags[k]), "ray": block.direction[row]}
+                         "amplitude": a["amplitude"][k], "flags": int(table.flags[k]), "ray": block.direction[row],
+                         "reach": table.sigma[k] * np.linalg.norm(block.direction[row])}
                         for k in mine
                     ]  # fmt: skip
                     members[owner] = {
@@ -129,7 +130,18 @@ def _expect_rows(points, echoes, members, flags, scales, offsets):
                 group.append({"source": p, "xyz": place(p), "flags": int(EchoFlag.NO_ECHO), "amplitude": None,
                               "ray": ray, "pulse": pulse[i], "time": members[i][p]})  # fmt: skip
             rows += sorted(group, key=lambda row: (row["time"], row["source"]))
-    return rows
+    # Points without a packet are the added echoes of their pulse that lie there, the nearest first.
+    added, alone = (
+        [k for k, row in enumerate(rows) if row["flags"] & flag] for flag in (EchoFlag.ADDED, EchoFlag.NO_WAVEFORM)
+    )
+    pairs = [(np.linalg.norm(np.subtract(rows[k]["xyz"], rows[j]["xyz"])), k, j)
+             for k in added for j in alone if rows[k]["pulse"] == rows[j]["pulse"]]  # fmt: skip
+    joined = set()
+    for off, k, j in sorted(pairs):
+        if off <= rows[k]["reach"] and not {k, j} & joined:
+            joined |= {k, j}
+            rows[k] |= {"source": rows[j]["source"], "flags": rows[k]["flags"] & ~EchoFlag.ADDED}
+    return [row for k, row in enumerate(rows) if k not in joined & set(alone)]
 
 
 def _expect_numbers(rows, echoes, members, points):
@@ -269,20 +281,24 @@ def test_points_without_a_location_come_first_of_their_packet(tiny_strip):
 
 def test_counts_are_those_of_a_loop(spoilt, tmp_path):
     report = run_one(spoilt, tmp_path).report
-    points, echoes, members, flags, _ = _read_packets(spoilt)
+    points, echoes, members, flags, prepared = _read_packets(spoilt)
+    header = prepared.facts.header
+    rows = _expect_rows(points, echoes, members, flags, header.scales, header.offsets)
+    without = sum(row["flags"] == EchoFlag.NO_WAVEFORM for row in rows)
+    joined = sum(flag == EchoFlag.NO_WAVEFORM for flag in flags.values()) - without
     found = {owner: group for owner, group in echoes.items() if group}
     matched = sum(echo["point"] >= 0 for group in found.values() for echo in group)
     expected = {
         "points_in": len(points),
-        "points_with_waveform": sum(flag == 0 for flag in flags.values()),
-        "points_without_waveform": sum(flag == EchoFlag.NO_WAVEFORM for flag in flags.values()),
+        "points_with_waveform": sum(flag == 0 for flag in flags.values()) + joined,
+        "points_without_waveform": without,
         "points_broken": sum(flag == EchoFlag.BROKEN_PACKET for flag in flags.values()),
         "waveforms": len(echoes),
         "echoes": sum(len(group) for group in found.values()),
-        "matched_returns": matched,
+        "matched_returns": matched + joined,
         "no_echo_returns": sum(len(members[owner]) for owner in echoes if not echoes[owner]),
         "unmatched_returns": sum(len(members[owner]) for owner in found) - matched,
-        "added_echoes": sum(echo["point"] < 0 for group in found.values() for echo in group),
+        "added_echoes": sum(echo["point"] < 0 for group in found.values() for echo in group) - joined,
     }
     for name, number in expected.items():
         assert report.count(name) == number, name
@@ -294,7 +310,8 @@ def test_counts_do_not_depend_on_the_units(edit_points, tmp_path, points):
 
     def change(rows):
         number, total = split_numbers(rows)
-        rows["wavepacket_index"][(number == 2) & (total > 2)] = 0
+        alone = (number == 2) & (total > 2)
+        rows["wavepacket_index"][alone], rows["gps_time"][alone] = 0, 0.0  # pulses are found within a unit
         return rows[np.random.default_rng(1).permutation(len(rows))]
 
     simulate_strip("forest", tmp_path / "a.las", pulses=400, seed=2)
@@ -370,6 +387,32 @@ def test_packets_of_equal_time_are_one_pulse_where_they_lie_on_one_line(edit_poi
     else:
         np.testing.assert_array_equal(np.bincount(number), np.bincount(first))
         np.testing.assert_array_equal(np.bincount(total), np.bincount(most))
+
+
+@pytest.mark.parametrize("which", ["first", "last"])
+def test_a_return_without_a_packet_takes_its_echo_from_another_packet_of_its_pulse(edit_points, tmp_path, which):
+    """Some strips have a packet for one return of a pulse only. The others were in the cloud twice, as points without a
+    waveform and as added echoes: half as many points again as there should be."""
+
+    def change(rows):
+        number, total = split_numbers(rows)
+        for name in ("wavepacket_index", "wavepacket_offset", "wavepacket_size"):
+            rows[name][number > 1 if which == "first" else number < total] = 0
+        rows["point_source_id"] = np.arange(len(rows))
+        return rows
+
+    simulate_strip("forest", tmp_path / "a.las", pulses=600, seed=2)
+    right = run_one(tmp_path / "a.las", tmp_path / "right").report
+    strip = edit_points(tmp_path / "a.las", tmp_path / "b.las", change)
+    done = run_one(strip, tmp_path / "out")
+    assert done.error is None
+    for name in ("echoes", "added_echoes", "matched_returns", "points_out"):
+        assert abs(done.report.count(name) - right.count(name)) <= 0.01 * right.count("points_in"), name
+    cloud, _ = read_cloud(tmp_path / "out/b.laz")
+    added = (cloud["echo_flags"] & EchoFlag.ADDED) != 0
+    np.testing.assert_array_equal(np.sort(cloud["point_source_id"][~added]), np.arange(right.count("points_in")))
+    returns = run_one(strip, tmp_path / "returns", points="returns").report
+    assert returns.count("points_out") == returns.count("points_in")
 
 
 def test_copies_of_copies_and_echoes_of_other_pulses_decide_nothing():

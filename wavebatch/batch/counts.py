@@ -20,8 +20,8 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 
 COUNTS: dict[str, str] = {
     "points_in": "points of the strip",
-    "points_with_waveform": "points whose packet can be read",
-    "points_without_waveform": "points without a packet (descriptor index 0 or packet size 0)",
+    "points_with_waveform": "points whose packet, or their echo in another packet of their pulse, can be read",
+    "points_without_waveform": "the other points without a packet (descriptor index 0 or packet size 0)",
     "points_broken": "points whose packet lies outside the file or does not fit its descriptor",
     "points_cut": "those of points_broken whose packet lies past the end of the file, which is incomplete",
     "waveforms": "packets that went through the chain, each once however many points share it",

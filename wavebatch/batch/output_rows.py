@@ -28,6 +28,7 @@ from wavebatch.kernels.geometry.group_returns import (
     find_pulses,
     find_rays,
     group_times,
+    match_returns,
     number_returns,
 )
 
@@ -179,6 +180,7 @@ def assemble_echoes(
     Notes
     -----
     A return that no echo of its packet matches is passed through with a flag, so that no return of the vendor is lost.
+    A return without a packet takes the added echo at its place, which another packet of its pulse shows.
     Index -1 means none: `np.append(x, y)[index]` gives y there, the last element.
     """
     if np.any((unit.packet_of_point >= 0) != (unit.point_flags == 0)):
@@ -193,22 +195,24 @@ def assemble_echoes(
     owned = np.append(unit.packets.owned, False)
     if not owned[echoes.table.waveform].all():
         raise _bug(unit, "an echo lies in a packet of another unit")
-    point = echoes.table.attributes["point"]
-    table = echoes.table.with_flags(EchoFlag.ADDED, point < 0)
     pulse = _find_pulses(unit, echoes, layout.source.header)
     counted = ~_find_copies(unit, echoes, pulse)
     written = np.flatnonzero(counted)
+    point = _find_owners(unit, echoes, pulse, counted, layout.source.header)
+    table = echoes.table.with_attributes(point=point)
+    table = replace(table, flags=table.flags & ~np.uint16(EchoFlag.ADDED)).with_flags(EchoFlag.ADDED, point < 0)
+    nearest = np.where(point >= 0, point, echoes.nearest)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
-    # Passed through: points without a usable packet, and points of owned packets that no echo matches.
-    missing = np.flatnonzero(unit.point_flags)
+    # Passed through: points without a usable packet or echo, and points of owned packets that no echo matches.
+    missing = np.flatnonzero((unit.point_flags > 0) & ~found[: len(own)])
     silent = np.flatnonzero(owned[members.packet] & ~found)
     passed = np.concatenate([missing, silent])
     no_echo = np.full(len(silent), EchoFlag.NO_ECHO, np.uint16)
     # Rows are sorted by the first point of their packet, or by their point where they have no packet.
     owner = np.append(unit.packets.owner - unit.start, -1)
     owner = owner[np.concatenate([table.waveform[written], members.packet[passed]])]
-    source = np.concatenate([members.find(echoes.nearest[written]), passed])
+    source = np.concatenate([members.find(nearest[written]), passed])
     owner = np.where(owner < 0, source, owner)
     # Points that share a packet are sorted by their return locations; NaN comes first.
     located = widen_integers(members.source["return_point_wave_location"][passed]) / PS_PER_NS
@@ -345,6 +349,38 @@ def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarra
     return pulse
 
 
+def _find_owners(
+    unit: Unit, echoes: UnitEchoes, pulse: np.ndarray, counted: np.ndarray, header: LasHeader
+) -> np.ndarray:
+    """The point in the file of each echo, i8 (k,), -1 for none, with those of added echoes that have no packet.
+
+    Some strips have a packet for one return of a pulse only: it shows the others too, which were in the cloud twice.
+    Vendors place returns within a pulse's width of their echoes.
+    """
+    table, point = echoes.table, echoes.table.attributes["point"].copy()
+    group = pulse[unit.packets.owner[table.waveform] - unit.start]
+    head = np.full(len(pulse), -1)
+    head[group] = table.waveform
+    alone = np.flatnonzero((unit.point_flags == EchoFlag.NO_WAVEFORM) & (head[pulse] >= 0))
+    free = np.flatnonzero(counted & (point < 0))
+    if not len(alone) or not len(free):
+        return point
+    sides = []
+    for of, places in (
+        (group[free], np.stack([table.attributes[name][free] for name in "xyz"], axis=1)),
+        (pulse[alone], locate(take_whole_records(unit.points, alone), header)),
+    ):
+        time = along_ray(places, echoes.origin[head[of]], echoes.direction[head[of]])
+        order = np.lexsort((time, of))
+        sides.append((order, of[order], time[order]))
+    (mine, echo_pulse, echo_time), (theirs, point_pulse, point_time) = sides
+    match = match_returns(echo_pulse, echo_time, point_pulse, point_time, np.inf)
+    pairs = np.flatnonzero(match >= 0)
+    pairs = pairs[np.abs(echo_time[pairs] - point_time[match[pairs]]) <= table.sigma[free[mine[pairs]]]]
+    point[free[mine[pairs]]] = unit.start + alone[theirs[match[pairs]]]
+    return point
+
+
 def find_shared(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarray:
     """Find the echoes that share their pulse with echoes of another one of its packets: bool (k,).
 
@@ -466,13 +502,13 @@ def _count(
     table = table if counted.all() else table.take(counted)
     counts = {
         "points_in": len(unit.points),
-        "points_with_waveform": unit.packet_of_point >= 0,
-        "points_without_waveform": unit.point_flags & np.uint16(EchoFlag.NO_WAVEFORM),
+        "points_with_waveform": (unit.packet_of_point >= 0) | found[: len(unit.points)],
+        "points_without_waveform": ((unit.point_flags & EchoFlag.NO_WAVEFORM) > 0) & ~found[: len(unit.points)],
         "points_broken": unit.point_flags & np.uint16(EchoFlag.BROKEN_PACKET),
         "waveforms": owned,
         "echoes": len(table),
         "added_echoes": table.attributes["point"] < 0,
-        "matched_returns": inside & found,
+        "matched_returns": found & (inside | (packet < 0)),
         "no_echo_returns": inside & ~has_echoes,
         "unmatched_returns": inside & has_echoes & ~found,
     }

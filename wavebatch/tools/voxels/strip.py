@@ -24,7 +24,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, count
-from wavebatch.core.waveforms import Radiometry, SystemPulse
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
 from wavebatch.files.disk.temp_store import ROWS_IN_MEMORY
@@ -213,7 +213,14 @@ def voxelize_strip(
                 )
             beam = sample_reference(reader, scan, source, pulse, setup.choice.survey.figures.spacing_ns or 0.0)
             doubts += tuple(filter(None, [source.doubt(), beam.doubt()]))
-            section_error = _share_error(setup.system.radiometry, source.distance or USUAL, beam.doubt_error())
+            # What all cross sections share: of constant, air, ranges and beam.
+            light = setup.system.radiometry
+            constant = max((error for _, error in light.channels.values()), default=light.constant_error)
+            shared = backscatter_error(
+                np.zeros(1), np.array([source.distance or USUAL]), light.sensor_error, constant, light.attenuation,
+                power=4, attenuation_err=light.attenuation_error,
+            )  # fmt: skip
+            section_error = math.hypot(float(shared[0]), 2.0 * (beam.doubt_error() or light.divergence_error))
         middle = _find_middle(reader, scan, options)
         floor, ceiling, shown = rays.Floor(middle), rays.Ceiling(middle, options.size), np.zeros(256, np.int64)
         for begin, end in pairwise(scan.borders.tolist()):
@@ -302,16 +309,6 @@ def voxelize_strip(
             split = summary.several_packets > 0 or scan.with_waveform == scan.packets
             summary.warnings += (*_doubt_returns(shown.reshape(16, 16), summary.pulses, split),)
             return summary
-
-
-def _share_error(light: Radiometry, distance: float, beam: float | None) -> float:
-    """The relative error that all cross sections share: of constant, air, ranges and beam; beam: of the divergence."""
-    constant = max((error for _, error in light.channels.values()), default=light.constant_error)
-    shared = backscatter_error(
-        np.zeros(1), np.array([distance]), light.sensor_error, constant, light.attenuation, power=4,
-        attenuation_err=light.attenuation_error,
-    )  # fmt: skip
-    return math.hypot(float(shared[0]), 2.0 * (beam or light.divergence_error))
 
 
 def _doubt_footprints(footprint: float, steep: float, ground_height: float) -> Iterator[str]:
