@@ -117,9 +117,11 @@ def test_counted_pulses_whose_points_are_missing_are_not_stored_twice(tmp_path):
 
 
 @pytest.mark.parametrize(("points", "said"), [(3, "crowded: 5 of 1000 pulses"), (1, "incomplete: 5 of 1000 pulses")])
-def test_half_a_percent_of_wrong_pulses_is_named(tmp_path, points, said):
+@pytest.mark.parametrize("begin", [1.0, -5e7], ids=["", "before September 2011"])
+def test_half_a_percent_of_wrong_pulses_is_named(tmp_path, points, said, begin):
+    """Points of flights with times below 0 were said to be missing where they are stored twice."""
     pulse, number, _ = number_returns(np.where(np.arange(1000) % 200, 2, points))
-    path = write_cloud(tmp_path / "c.las", 1.0 + pulse, -2.0 * number, number, np.full(len(pulse), 2))
+    path = write_cloud(tmp_path / "c.las", begin + pulse, -2.0 * number, number, np.full(len(pulse), 2))
     assert any(line.startswith(said) for line in count_returns([path])[1].warnings)
 
 

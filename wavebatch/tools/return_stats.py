@@ -323,6 +323,9 @@ _WHOLE_RANKS = (*(f"{k}-{k + 1}" for k in range(1, 15)), "15-")
 _NOT_A_TIME = np.uint64(0x7FF8 << 48)
 """Bits of a NaN: above the key of every GPS time that is a number and at least 0."""
 
+_BEFORE_ZERO = np.uint64(1 << 63)
+"""Least key of a GPS time below 0: adjusted standard times before September 2011."""
+
 _MOST_COUNTED = np.uint64(1 << 48)
 """Above any number of a pulse that is counted, below the bits of any time."""
 
@@ -501,7 +504,7 @@ class _Tally:
         self.incomplete += int(np.count_nonzero(counts != total))
         # Runs of rising return numbers, where points have no time, grow together where points are missing.
         key = rows["key"][first]
-        by_time = (key > _MOST_COUNTED) & (key < _NOT_A_TIME)
+        by_time = (key > _MOST_COUNTED) & ((key < _NOT_A_TIME) | (key >= _BEFORE_ZERO))
         self.crowded += int(np.count_nonzero((counts > total) & (total > 0) & by_time))
         # Pulses with several returns, and the height of their first above their last return [m].
         last = np.append(first[1:], len(rows)) - 1
