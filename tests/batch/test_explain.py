@@ -39,6 +39,19 @@ def test_a_plain_strip_has_none(tiny_strip, tmp_path):
     assert remarks(tiny_strip, tmp_path) == []
 
 
+@pytest.mark.parametrize(("every", "said"), [(5, True), (50, False)])
+def test_haze_at_the_start_of_packets_is_said(tiny_strip, tmp_path, every, said):
+    """All such echoes were false, in silence."""
+
+    def change(samples):
+        packets = samples.reshape(-1, 80)
+        packets[::every] += np.rint(20 * np.exp(-np.arange(80) / 8.0)).astype(np.uint8)
+        return packets.ravel()
+
+    lines = remarks(change_packets(tiny_strip, tmp_path / "haze.las", change), tmp_path / "out")
+    assert [line for line in lines if "NEAR_EDGE" in line] == lines and len(lines) == said
+
+
 @pytest.mark.slow
 def test_fits_that_fail_far_more_than_usual_are_said_with_quiet_too(leica, tiny_strip, tmp_path):
     """77 % of the fits of --profile fast did not converge, and nothing was said."""

@@ -278,6 +278,10 @@ MOST_FAILED = 0.2
 strip 6 % at most (17 to 22 % on four of 300 simulated ones); 21 % in fog, 24 % where a receiver recovers slowly from
 clipped echoes, 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place of the learned pulse."""
 
+MOST_CUT = 0.08
+"""Share of echoes at the edge of their packet that a user must know of: 6 % in packets that are cut to their signal
+(NEON), 0 to 2 % on other real strips; 9 to 14 % where haze begins a fifth of the packets, all of it false."""
+
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
 
@@ -358,6 +362,13 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[tuple[str, ...]
     if last:
         lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
                      "the ground: return numbers stay those of the whole pulse")  # fmt: skip
+    cut, written = report.flags.get("NEAR_EDGE", 0), report.count("points_out") - sum(report.passed_through.values())
+    if written >= LEAST_JUDGED and cut > MOST_CUT * written:
+        lines.append(
+            f"{cut} of {written} echoes ({100 * cut / written:.0f} %) are NEAR_EDGE: packets begin or end on them, so "
+            "widths are less sure, and haze at the start of packets looks like such echoes; draw some with "
+            "`wavebatch plot waveform --flags`, or leave them out with --drop-flags NEAR_EDGE"
+        )
     if report.copied_echoes:
         lines.append(f"packets of a pulse overlap: {report.copied_echoes} echoes that another of them has do not count")
     layout, added = prepared.layout, report.flags.get("ADDED", 0)  # those that are written
