@@ -20,6 +20,7 @@ from wavebatch.surveying.matching.strip_energies import (
     _compare_drift,
     _compare_unknown,
     _find_gains,
+    _is_of_echoes,
     take_energies,
 )
 
@@ -107,6 +108,30 @@ def test_logs_of_one_laser_that_scatter_alike_are_not_stuck(own, stuck):
     known = Calibration(1.0, 0.03, energy_mean=1.0, energy_spread=0.061)
     lacks, line = _compare(PulseEnergy("log.csv", shots=own), known)
     assert ("is the log stuck?" in line) == stuck and lacks == pytest.approx((0.061**2 - own**2) ** 0.5)
+
+
+def test_amplitudes_as_energies_are_refused(tmp_path, flickering):
+    """Values over all fields were those of the target, 52 % off with 7 % of error."""
+    strip, tops = tmp_path / "s.las", []
+    write_strip(strip, FARMLAND, FLICKERS, 8000, seed=3, receive=lambda wave: (tops.append(wave.max(axis=1)), wave)[1])
+    log = write_log(tmp_path / "log.csv", strip, lambda _: tops[0])
+    done = call("run", strip, "-o", tmp_path / "out", "--energy", log, "--columns", "+amplitude_normalized")
+    assert done.exit_code == 4 and "alike where the ground is, as amplitudes of echoes are" in done.stderr
+
+
+@pytest.mark.parametrize("fades", [0.0, 0.3])
+def test_energies_of_lasers_over_even_ground_are_those_of_pulses(fades):
+    """Light over them is even there, as it is over amplitudes."""
+    rng = np.random.default_rng(4)
+    number = np.arange(8000)
+    x, y = 200.0 * (number / 400 % 1.0), number * 0.003
+    sent = (1 + 0.1 * rng.standard_normal(8000)) * (1 - fades * number / 8000)
+    ground = np.where(np.floor(x / 20) % 2 == np.floor(y / 8) % 2, 0.3, 0.6)
+    noise = 1 + 0.02 * rng.standard_normal(8000)
+    rest = np.zeros((2, 8000))
+    assert not _is_of_echoes(np.stack([number * 1e-5, sent * noise, sent, *rest, x, y]))
+    assert _is_of_echoes(np.stack([number * 1e-5, ground * sent * noise, ground * sent, *rest, x, y]))
+    assert not _is_of_echoes(np.stack([number * 1e-5, ground * sent * noise, sent, *rest, x, y]))
 
 
 @pytest.mark.quick_cases("held", "right")

@@ -907,6 +907,19 @@ def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, edit_point
     assert done.exit_code == 0 and "vectors" not in done.stderr
 
 
+def mirror(points):
+    points["y_t"] *= -1
+
+
+def test_mirrored_vectors_give_no_range(tmp_path, edit_points):
+    """The sensor was 700 m below the ground, in silence, and what `calibrate` wrote could not be read."""
+    write_strip(tmp_path / "s.las", FARMLAND, SENSOR, 6000, seed=85)
+    edit_points(tmp_path / "s.las", tmp_path / "m.las", mirror)
+    done = call("run", tmp_path / "m.las", "-o", tmp_path / "out", "--columns", "range,range_error")
+    assert done.exit_code == 0 and "axes are swapped or mirrored, --direction is the other one" in done.stderr
+    assert np.isnan(wb.read_cloud(tmp_path / "out" / "m.laz")["range"]).all()
+
+
 def test_an_outline_around_many_fields_is_named_and_in_the_error(tmp_path, calibrated):
     """A radius of 150 m in place of 5: the constant of all fields together, with the error of one."""
     (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.3,{EAST + 50},{NORTH + 10},150\n")

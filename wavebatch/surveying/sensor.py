@@ -228,8 +228,8 @@ class SensorSource:
         if spread:
             return (
                 f"range: the packets' vectors spread by {spread:.0f} degrees, but do not meet in a path of the sensor: "
-                "points and vectors are of two CRSs, axes are swapped, times are wrong or the same for two sensors; "
-                "new echoes lie along them"
+                "points and vectors are of two CRSs, axes are swapped or mirrored, --direction is the other one, times "
+                "are wrong or the same for two sensors; new echoes lie along them"
             )
         if self.height and facts.get("relief_m", 0.0) > HEIGHT_ERROR * self.height:
             return (
@@ -758,6 +758,10 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     above = _measure_heights(rays.point[sure] - path.at(rays.time[sure]), unit)
     above *= above > LEAST_HEIGHTS * distance
     if np.mean(miss > LARGEST_MISS * distance) > MOST_MISS or above > LARGEST_MISS * distance:
+        return None
+    # Mirrored vectors meet as well, but behind the points; pairs may be in any order.
+    behind = np.einsum("ni,ni->n", rays.point[sure] - path.at(rays.time[sure]), unit) < 0.0
+    if kind == "direction vectors" and np.mean(behind) > 0.5:
         return None
     error, facts = float(np.sqrt(np.mean(squares) + motion + above**2)), _describe(found, path, rays)
     wait, known = np.diff(path.time)[:, None], np.diff(path.time) <= path.gap

@@ -289,19 +289,15 @@ def compare_returns(blocks: Iterable[tuple[WaveformBlock, np.ndarray]]) -> np.nd
             last = first + len(samples)
             height, level = samples.max(axis=1).astype(float), median(samples, axis=1)
             height -= level
-            found = np.stack([_read_height(samples, at[first:last]) - level for at in sets]) / np.maximum(height, 1.0)
+            # The highest of three samples at each place; one beyond the end has that of the end.
+            end, row = samples.shape[1] - 1, np.arange(len(samples))[:, None]
+            middles = (np.rint(np.clip(at[first:last, None], 0, end)).astype(np.int64) for at in sets)
+            near = [samples[row, np.clip(middle + (-1, 0, 1), 0, end)].max(axis=1) for middle in middles]
+            found = (np.stack(near) - level) / np.maximum(height, 1.0)
             table = [height, samples.argmax(axis=1), place, strength, found[0], found[1:].mean(axis=0)]
             tables.append(np.column_stack([*table, level - samples.min(axis=1), point])[height > 0])
             first = last
     return np.concatenate(tables)
-
-
-def _read_height(samples: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """The highest of three samples (n, s) at a place (n,) of each; one beyond the end has that of the end."""
-    end = samples.shape[1] - 1
-    middle = np.rint(np.clip(place, 0, end)).astype(np.int64)
-    near = [np.clip(middle + step, 0, end) for step in (-1, 0, 1)]
-    return np.maximum.reduce([samples[np.arange(len(samples)), at] for at in near])
 
 
 INDEX_BITS = np.uint64(8)

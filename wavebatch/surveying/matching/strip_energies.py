@@ -23,6 +23,7 @@ from wavebatch.surveying.calibration import CHANGE_CHANCE, Calibration
 from wavebatch.surveying.matching.setting import (
     BORDER,
     CELLS,
+    LEAST_CELLS,
     QUANTILES,
     SCANNERS,
     compare_scenes,
@@ -53,6 +54,12 @@ LEAST_APART, SURE_TURNS, ALIKE_TURNS, CYCLES = 0.04, 6.0, 0.7, 4
 of either size: the strongest period counts, so that sound scenes reach 4, rows of plants 5.3, and 12 in one size;
 by how much as in larger cells it does in smaller ones, where ground that swings gradually shows half; and fewest
 periods that show it."""
+
+PAIR, OF_GROUND, OF_LIGHT = 2, 0.6, 0.5
+"""Mean number of pulses in the small cells that show whether a log is that of echoes: two of its values in one cell
+differ by less than this share of what others as far apart in time do (0.1 to 0.25, 0.6 over even ground; logs of lasers
+0.8 to 1), and light over it varies by less than this share of what light does (0.03 to 0.45; logs of lasers 0.7 to 1,
+less over even ground)."""
 
 LEAST_COMPARED = 200
 """Pulses that show either."""
@@ -129,6 +136,8 @@ def take_energies(
     growth = noise = 0.0
     if energy is not None and request is not None:
         doubt, noise = judge_energies(pulses[1], pulses[2])
+        if _is_of_echoes(pulses):
+            doubt = "they are alike where the ground is, as amplitudes of echoes are, not energies of emitted pulses"
         if doubt:
             raise InputError(
                 f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
@@ -197,6 +206,24 @@ def take_energies(
     if energy is None:
         return StripEnergies(None, lacks, growth, tuple(notes))
     return StripEnergies(replace(energy, missed=math.hypot(lacks, noise)), 0.0, growth, tuple(notes))
+
+
+def _is_of_echoes(pulses: np.ndarray) -> bool:
+    """Whether a log holds the light of echoes: emitted pulses do not know what they will hit; pulses: as `_join`."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pulses = np.concatenate([np.log(pulses[1:3]), pulses[5:]])[:, pulses[3] == pulses[3, :1]]
+    light, sent, *place = pulses[:, np.isfinite(pulses).all(axis=0)]
+    if len(sent) < LEAST_COMPARED:
+        return False
+    *_, first, cell, count = cut_cells(np.stack(place), PAIR)
+    last = len(cell) - 1 - np.unique(cell[::-1], return_index=True)[1]
+    first, last = first[count > 1], last[count > 1]
+    if len(first) < LEAST_CELLS:
+        return False
+    # Earlier and later ones: a laser that fades moves their differences, too.
+    later = (np.stack([last + step, last - step]) % len(sent) for step in (0, *MEMORIES[:3]))
+    near, *others = (np.median(np.abs(sent[first] - sent[rows])) for rows in later)
+    return bool(near < OF_GROUND * max(others) and robust_std(light - sent) < OF_LIGHT * robust_std(light))
 
 
 def _find_gains(pulses: np.ndarray) -> tuple[float, float, int]:
