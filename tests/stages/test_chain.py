@@ -314,10 +314,12 @@ def test_a_stage_that_fails_names_itself_and_the_waveforms_in_one_line(failure):
     ("give", "said"),
     [(lambda echoes, name: None, "returned NoneType in place of EchoTable"), (lambda echoes, name: echoes, "no column"),
      (lambda echoes, name: echoes.with_attributes(**{name: np.zeros((len(echoes), 2))}), "no column"),
-     (lambda echoes, name: echoes.with_attributes(**{name: np.full(len(echoes), "x")}), "no column")],
+     (lambda echoes, name: echoes.with_attributes(**{name: np.full(len(echoes), "x")}), "no column"),
+     (lambda echoes, name: echoes.with_attributes(**{name: np.multiply(echoes.amplitude, 2, echoes.amplitude)}),
+      "read-only")],
 )  # fmt: skip
 def test_a_stage_that_breaks_its_promise_is_named(give, said):
-    """The column was no-data, or its first part, for every echo, in silence."""
+    """The column was no-data, or its first part, for every echo, in silence; or another column changed with it."""
 
     @stage("attribute", makes=(Column("promised", "f4", "-", "nothing"),))
     def broken(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:

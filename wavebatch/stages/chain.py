@@ -457,6 +457,9 @@ class Chain:
     def _call(self, step: Step, data: Mapping[str, Any], timing: dict[str, Seconds] | None) -> Any:
         """The result of a stage."""
         start, block = Seconds.now(), data["block"]
+        echoes: EchoTable = data.get("echoes", EchoTable.empty())
+        for values in (*echoes.columns().values(), *echoes.attributes.values()):  # a plug-in may write in place
+            values.flags.writeable = False
         try:
             result = step.stage.function(*(data[name] for name in KINDS[step.stage.kind][0]), **step.parameters)
         except ConfigError as error:
