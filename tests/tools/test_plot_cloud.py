@@ -231,7 +231,10 @@ def test_maps_say_their_crs_and_refuse_two(tmp_path, riegl, cloud):
     las.write(other)
     assert grid_values([other], "z").crs.unit == "us-ft"
     assert grid_values([other], None, "density").label == "points per area [1/us-ft2]"
-    refuses(ConfigError, "its CRS is", grid_values, [riegl, other], "z")
+    refuses(ConfigError, "its CRS is", grid_values, [riegl, other], None, "density")
+    for count in (grid_values, count_values):  # heights in feet and metres were one histogram
+        refuses(ConfigError, r"z is in \[us-ft\], z of .* in \[m\]", count, [riegl, other], "z")
+    count_values([riegl, cloud], "z")
     assert grid_values([cloud], "z").crs.name == ""
 
 

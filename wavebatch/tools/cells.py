@@ -92,8 +92,11 @@ class Clouds:
         for path in self.paths:
             with self._open(path) as reader:
                 found.append(reader.facts)
-        every = []
+        every, words = [], [describe_crs(path) for path in self.paths]
         for column in zip(*found, strict=True):
+            if column[0].is_standard and column[0].name in ("x", "y", "z"):  # a coordinate has the unit of the CRS
+                units = [each.upright_unit if column[0].name == "z" else each.unit for each in words]
+                column = [replace(facts, unit=unit) for facts, unit in zip(column, units, strict=True)]
             first = column[0]
             for path, facts in zip(self.paths, column, strict=True):
                 if (facts.unit, facts.is_flags) != (first.unit, first.is_flags):
@@ -102,11 +105,7 @@ class Clouds:
                         f"[{first.unit}]; plot them one by one"
                     )
             # The shortest name: one cloud may have `wb_amplitude` beside an `amplitude` of its strip.
-            facts = replace(first, name=min((one.name for one in column), key=len))
-            if facts.is_standard and facts.name in ("x", "y", "z"):  # a coordinate has the unit of the CRS
-                words = describe_crs(self.paths[0])
-                facts = replace(facts, unit=words.upright_unit if facts.name == "z" else words.unit)
-            every.append(facts)
+            every.append(replace(first, name=min((one.name for one in column), key=len)))
         self.every = tuple(every)
         """Facts of the columns."""
         self.facts = self.every[0]
