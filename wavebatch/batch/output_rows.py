@@ -198,9 +198,8 @@ def assemble_echoes(
     pulse = _find_pulses(unit, echoes, layout.source.header)
     counted = ~_find_copies(unit, echoes, pulse)
     written = np.flatnonzero(counted)
-    point = _find_owners(unit, echoes, pulse, counted, layout.source.header)
-    table = echoes.table.with_attributes(point=point)
-    table = replace(table, flags=table.flags & ~np.uint16(EchoFlag.ADDED)).with_flags(EchoFlag.ADDED, point < 0)
+    table = _match_alone(unit, echoes, pulse, counted, layout.source.header)
+    point = table.attributes["point"]
     nearest = np.where(point >= 0, point, echoes.nearest)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
@@ -279,13 +278,16 @@ def assemble_returns(
     """
     if not echoes.read.all():
         raise _bug(unit, "a packet of its points was not read")
-    table, n = echoes.table, len(unit.points)
+    pulse, n = _find_pulses(unit, echoes, layout.source.header), len(unit.points)
+    repeated = _find_copies(unit, echoes, pulse)
+    table = _match_alone(unit, echoes, pulse, ~repeated, layout.source.header)
     local = table.attributes["point"] - unit.start
     mine = np.flatnonzero((table.attributes["point"] >= 0) & (local >= 0) & (local < n))
     echo = np.full(n, -1, np.int64)
     echo[local[mine]] = mine
     found = echo >= 0
-    if np.count_nonzero(found) != len(mine) or np.any(unit.packet_of_point[local[mine]] != table.waveform[mine]):
+    strange = (unit.packet_of_point[local[mine]] != table.waveform[mine]) & (unit.point_flags[local[mine]] == 0)
+    if np.count_nonzero(found) != len(mine) or strange.any():
         raise _bug(unit, "echoes and returns are not matched one to one")
     reason = np.where(unit.point_flags > 0, unit.point_flags, np.uint16(EchoFlag.NO_ECHO)).astype(np.uint16)
     flags = np.where(found, np.append(table.flags, np.uint16(0))[echo], reason).astype(np.uint16)
@@ -295,7 +297,7 @@ def assemble_returns(
     packet = unit.packet_of_point
     # An echo counts in the unit of its point, where the second pass has seen it; without one in that of its packet.
     counted = unit.packets.owned[table.waveform] & (table.attributes["point"] < 0)
-    copied = counted & _find_copies(unit, echoes, _find_pulses(unit, echoes, layout.source.header))
+    copied = counted & repeated
     counted[copied], counted[mine] = False, True
     rest = np.where(found, np.uint16(0), reason)
     report = _count(unit, table, counted, unit.points, packet, found, packet >= 0, rest)
@@ -349,36 +351,37 @@ def _find_pulses(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarra
     return pulse
 
 
-def _find_owners(
+def _match_alone(
     unit: Unit, echoes: UnitEchoes, pulse: np.ndarray, counted: np.ndarray, header: LasHeader
-) -> np.ndarray:
-    """The point in the file of each echo, i8 (k,), -1 for none, with those of added echoes that have no packet.
+) -> EchoTable:
+    """The echoes, with points that have no packet as the returns of added ones that a packet of their pulse shows.
 
-    Some strips have a packet for one return of a pulse only: it shows the others too, which were in the cloud twice.
-    Vendors place returns within a pulse's width of their echoes.
+    Some strips have a packet for one return of a pulse only: the other returns were in the cloud twice. Vendors place
+    returns within a pulse's width of their echoes.
     """
     table, point = echoes.table, echoes.table.attributes["point"].copy()
-    group = pulse[unit.packets.owner[table.waveform] - unit.start]
+    owned = unit.packets.owned[table.waveform]
+    group = pulse[np.where(owned, unit.packets.owner[table.waveform] - unit.start, 0)]
     head = np.full(len(pulse), -1)
-    head[group] = table.waveform
+    head[group[owned]] = table.waveform[owned]
     alone = np.flatnonzero((unit.point_flags == EchoFlag.NO_WAVEFORM) & (head[pulse] >= 0))
-    free = np.flatnonzero(counted & (point < 0))
-    if not len(alone) or not len(free):
-        return point
-    sides = []
-    for of, places in (
-        (group[free], np.stack([table.attributes[name][free] for name in "xyz"], axis=1)),
-        (pulse[alone], locate(take_whole_records(unit.points, alone), header)),
-    ):
-        time = along_ray(places, echoes.origin[head[of]], echoes.direction[head[of]])
-        order = np.lexsort((time, of))
-        sides.append((order, of[order], time[order]))
-    (mine, echo_pulse, echo_time), (theirs, point_pulse, point_time) = sides
-    match = match_returns(echo_pulse, echo_time, point_pulse, point_time, np.inf)
-    pairs = np.flatnonzero(match >= 0)
-    pairs = pairs[np.abs(echo_time[pairs] - point_time[match[pairs]]) <= table.sigma[free[mine[pairs]]]]
-    point[free[mine[pairs]]] = unit.start + alone[theirs[match[pairs]]]
-    return point
+    free = np.flatnonzero(owned & counted & (point < 0))
+    if len(alone) and len(free):
+        sides = []
+        for of, places in (
+            (group[free], np.stack([table.attributes[name][free] for name in "xyz"], axis=1)),
+            (pulse[alone], locate(take_whole_records(unit.points, alone), header)),
+        ):
+            time = along_ray(places, echoes.origin[head[of]], echoes.direction[head[of]])
+            order = np.lexsort((time, of))
+            sides.append((order, of[order], time[order]))
+        (mine, echo_pulse, echo_time), (theirs, point_pulse, point_time) = sides
+        match = match_returns(echo_pulse, echo_time, point_pulse, point_time, np.inf)
+        pairs = np.flatnonzero(match >= 0)
+        pairs = pairs[np.abs(echo_time[pairs] - point_time[match[pairs]]) <= table.sigma[free[mine[pairs]]]]
+        point[free[mine[pairs]]] = unit.start + alone[theirs[match[pairs]]]
+        table = replace(table.with_attributes(point=point), flags=table.flags & ~np.uint16(EchoFlag.ADDED))
+    return table.with_flags(EchoFlag.ADDED, point < 0)
 
 
 def find_shared(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarray:
