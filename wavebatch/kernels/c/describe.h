@@ -33,7 +33,7 @@ static int furnish(Desk *d, int64_t rows, int64_t vectors) {
     d->vectors = vectors;
     return enlarge(&d->x, row) && enlarge(&d->weight, row) && enlarge(&d->rest, row) && enlarge(&d->rows, n * row)
         && enlarge(&d->modes, (6 + 2 * CHANGED) * row) && enlarge(&d->gram, n * n * sizeof(double)) && enlarge(&d->matrix, n * n * sizeof(double))
-        && enlarge(&d->pivot, n * sizeof(double)) && enlarge(&d->column, n * sizeof(double));
+        && enlarge(&d->pivot, n * sizeof(double)) && enlarge(&d->column, n * sizeof(wide));
 }
 
 static void clear_desk(Desk *d) {
@@ -128,9 +128,9 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
             d->matrix[r * p + c] = d->gram[r * p + c] * d->column[r] * d->column[c] + (r == c ? NEARLY_SINGULAR : 0);
     factor(p, d->matrix, d->pivot, 0.1 * NEARLY_SINGULAR);
     for (int64_t r = 0; r < p; r++) {
-        for (int64_t c = 0; c < p; c++) d->column[c] = c == r;
-        solve_part(p, d->matrix, d->column, r, r);
-        sum += 0.5 * (log_double(at_least(d->column[r], 1)) + log_double(at_most(d->pivot[r], 2)));
+        const int64_t q = r % LANES;
+        if (!q) invert_columns(p, d->matrix, r, r, (wide *)d->column);
+        sum += 0.5 * (log_double(at_least(d->column[LANES * r + q], 1)) + log_double(at_most(d->pivot[r], 2)));
     }
     return sum;
 }

@@ -15,7 +15,6 @@ static const double UNDETERMINED = 1e30;       /* pivot of an unknown that the d
 static const int MOST_IDLE = 2;                /* iterations with an echo of no amplitude, whose time then drifts: it is
                                                   left out before the others are fitted on (decompose.h) */
 static const int CENSORED = 100;               /* least iterations with clipped samples: starts are far off (H6) */
-static const int64_t LONG = 12;                /* vectors of a window in which waiting for sums costs more than a call */
 
 static const double LEAST_AWAY = 0.25;         /* of a peak from a log-normal's origin, where the pulse has no width */
 static const double LEAST_WIDTH = 0.1;         /* below it a fit without damping is lost: the echo lies on one sample */
@@ -59,33 +58,43 @@ INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work,
     for (int64_t i = 0; i <= per * k && w->is_whitened; i++) whiten(w, work->rows + i * n);
 }
 
-/* The same to the same bits where rows are long: a sum waits for each of its additions, so there are eight at a time. */
-static void multiply_long_rows(int64_t rows, int64_t vectors, const lanes *row, double *gram) {
-    for (int64_t i = 0; i < rows; i += 2) {
-        const int64_t next = i + 1 < rows ? i + 1 : i;
-        for (int64_t j = 0; j <= next; j += 4) {
-            const lanes *a = row + i * vectors, *other = row + next * vectors, *b[4];
-            lanes sum[4], also[4];
-            for (int64_t q = 0; q < 4; q++) {
-                b[q] = row + (j + q < next ? j + q : next) * vectors;
-                sum[q] = a[0] * b[q][0];
-                also[q] = other[0] * b[q][0];
-            }
-            for (int64_t v = 1; v < vectors; v++)
-                for (int64_t q = 0; q < 4; q++) { sum[q] += a[v] * b[q][v]; also[q] += other[v] * b[q][v]; }
-            for (int64_t q = 0; q < 4; q++) {
-                if (j + q <= i) gram[i * rows + j + q] = sum_lanes(sum[q]);
-                if (j + q <= next) gram[next * rows + j + q] = sum_lanes(also[q]);
-            }
-        }
-    }
+/* Inner products of rows at .. at + 3, as many as there are. */
+INLINE void multiply_corner(int64_t rows, int64_t vectors, const lanes *row, int64_t at, double *gram) {
+    const lanes *some[4];
+    lanes sum[12] = {{0}};
+    for (int64_t i = 0; i < 4; i++) some[i] = row + (at + i < rows ? at + i : at) * vectors;
+    for (int64_t v = 0; v < vectors; v++)
+        for (int64_t i = 0, q = 0; i < 4; i++)
+            for (int64_t j = 0; j <= i; j++, q++) sum[q] += some[i][v] * some[j][v];
+    const lanes done[] = {sum_four(sum[0], sum[1], sum[2], sum[3]), sum_four(sum[4], sum[5], sum[6], sum[7]), sum_four(sum[8], sum[9], sum[9], sum[9])};
+    for (int64_t i = 0, q = 0; i < 4 && at + i < rows; i++)
+        for (int64_t j = 0; j <= i; j++, q++) gram[(at + i) * rows + at + j] = done[q / 4][q % 4];
 }
 
-/* Inner products of all rows: the lower triangle of gram, (rows, rows). */
+/* Inner products of row i, and of the next where there is one, with rows at .. at + 3 before them. */
+INLINE void multiply_pair(int64_t rows, int64_t vectors, const lanes *row, int64_t i, int64_t at, double *gram) {
+    const int64_t next = i + 1 < rows;
+    const lanes *one = row + i * vectors, *two = one + next * vectors, *other = row + at * vectors;
+    lanes sum[8] = {{0}};
+    for (int64_t v = 0; v < vectors; v++)
+        for (int64_t q = 0; q < 4; q++) {
+            sum[q] += one[v] * other[q * vectors + v];
+            if (next) sum[4 + q] += two[v] * other[q * vectors + v];
+        }
+    lanes done = sum_four(sum[0], sum[1], sum[2], sum[3]);
+    for (int64_t q = 0; q < 4; q++) gram[i * rows + at + q] = done[q];
+    if (!next) return;
+    done = sum_four(sum[4], sum[5], sum[6], sum[7]);
+    for (int64_t q = 0; q < 4; q++) gram[(i + 1) * rows + at + q] = done[q];
+}
+
+/* Inner products of all rows: the lower triangle of gram, (rows, rows). To wait for each addition of a sum takes longer than
+   to make it, so there are four to ten sums at a time. */
 INLINE void multiply_rows(int64_t rows, int64_t vectors, const lanes *row, double *gram) {
-    if (vectors > LONG) { multiply_long_rows(rows, vectors, row, gram); return; }
-    for (int64_t i = 0; i < rows; i++)
-        for (int64_t j = 0; j <= i; j++) gram[i * rows + j] = multiply(vectors, row + i * vectors, row + j * vectors);
+    for (int64_t at = 0; at < rows; at += 4) {
+        multiply_corner(rows, vectors, row, at, gram);
+        for (int64_t i = at + 4; i < rows; i += 2) multiply_pair(rows, vectors, row, i, at, gram);
+    }
 }
 
 /* Takes off the products of row i with those up to it what `take_level_off` would take off both: (I - l l')^2 = I - (2 - l'l) l l'.
@@ -99,9 +108,17 @@ INLINE void take_level_off_products(Work *work, int64_t i, double along, double 
 /* Inner products of the rows without their levels. */
 INLINE void find_products(int64_t rows, Work *work, double *gram) {
     const Window *w = &work->window;
-    multiply_rows(rows, w->vectors, work->rows, gram);
-    for (int64_t i = 0; i < rows && w->level_share > 0; i++)
-        take_level_off_products(work, i, multiply(w->vectors, work->rows + i * w->vectors, w->level), gram + i * rows);
+    const int64_t n = w->vectors;
+    multiply_rows(rows, n, work->rows, gram);
+    for (int64_t i = 0; i < rows && w->level_share > 0; i += 4) {
+        const lanes *row[4];
+        lanes sum[4] = {{0}};
+        for (int64_t q = 0; q < 4; q++) row[q] = work->rows + (i + q < rows ? i + q : i) * n;
+        for (int64_t v = 0; v < n; v++)
+            for (int64_t q = 0; q < 4; q++) sum[q] += row[q][v] * w->level[v];
+        const lanes along = sum_four(sum[0], sum[1], sum[2], sum[3]);
+        for (int64_t q = 0; q < 4 && i + q < rows; q++) take_level_off_products(work, i + q, along[q], gram + (i + q) * rows);
+    }
 }
 
 /* Adds to the products what is known of widths (H1) and skews (1.2) before the fit; the cost of that. */
@@ -145,19 +162,29 @@ INLINE void factor(int64_t n, double *matrix, double *pivot, double least) {
     }
 }
 
-/* Solves the equations that `factor` left for a right side of zeros before row `from`, down to row `to` of the solution;
-   above it is no result. */
-INLINE void solve_part(int64_t n, const double *factors, double *restrict right, int64_t from, int64_t to) {
-    for (int64_t j = from; j < n; j++) {
+/* Solves the equations that `factor` left, in place. */
+INLINE void solve(int64_t n, const double *factors, double *restrict right) {
+    for (int64_t j = 0; j < n; j++) {
         const double *restrict row = factors + j * n, share = right[j] * row[j];
         for (int64_t i = j + 1; i < n; i++) right[i] -= row[i] * share;
         right[j] = share;
     }
-    for (int64_t i = n - 1; i > to; i--)
-        for (int64_t j = to; j < i; j++) right[j] -= factors[i * n + j] * right[i];
+    for (int64_t i = n - 1; i > 0; i--)
+        for (int64_t j = 0; j < i; j++) right[j] -= factors[i * n + j] * right[i];
 }
 
-INLINE void solve(int64_t n, const double *factors, double *right) { solve_part(n, factors, right, 0, 0); }
+/* LANES columns, from one on, of the inverse of what `factor` left, side by side, down to row `to`; above it is no result. */
+INLINE void invert_columns(int64_t n, const double *factors, int64_t from, int64_t to, wide *column) {
+    memset(column, 0, n * sizeof(wide));
+    for (int64_t q = 0; q < LANES && from + q < n; q++) column[from + q][q] = 1;
+    for (int64_t j = from; j < n; j++) {
+        const wide share = column[j] * factors[j * n + j];
+        for (int64_t i = j + 1; i < n; i++) column[i] -= factors[j * n + i] * share;
+        column[j] = share;
+    }
+    for (int64_t i = n - 1; i > to; i--)
+        for (int64_t j = to; j < i; j++) column[j] -= factors[i * n + j] * column[i];
+}
 
 /* What one unit of a row's coefficient means: 1 for amplitudes, width / amplitude for times and widths, 1 / amplitude
    for skews. Amplitudes below half of the noise count as that. */
@@ -227,7 +254,8 @@ INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *
         raise = accepted ? RAISE : 2 * raise;
         if (accepted) {
             memcpy(fit->parameters, trial, n * sizeof(double));
-            memcpy(fit->gram, work->products, rows * rows * sizeof(double));
+            double *kept = fit->gram;
+            fit->gram = work->products; work->products = kept;
             fit->cost = cost;
         }
         idle = k > 1 && has_vanished(k, fit->parameters) ? idle + 1 : 0;
@@ -281,20 +309,21 @@ static void fit_undamped(int64_t k, const Settings *s, const Limits *limits, Wor
 /* The inverse of the equations: variances, and what the width shares with amplitude and time; false if they are steep. */
 INLINE int invert(int64_t k, int64_t per, Work *work, const double *gram, double *variance, double *shared) {
     const int64_t n = per * k, rows = n + 1;
-    double *matrix = work->matrix, *column = work->column;
+    double *matrix = work->matrix;
+    wide *column = (wide *)work->column;
     int is_flat = 1;
     for (int64_t i = 0; i < n; i++) {
         for (int64_t j = 0; j <= i; j++) matrix[i * n + j] = gram[i * rows + j];
         matrix[i * n + i] = matrix[i * n + i] * (1 + RIDGE) + RIDGE + (i < k ? work->known[i] : 0);
     }
     factor(n, matrix, work->pivot, 1e-300);
-    for (int64_t c = 0; c < n; c++) {
-        memset(column, 0, n * sizeof(double));
-        column[c] = 1;
-        solve_part(n, matrix, column, c, c / k == 2 ? c - 2 * k : c);
-        variance[c] = column[c];
-        is_flat &= column[c] * gram[c * rows + c] < STEEP && column[c] > 0;
-        if (c / k == 2) { shared[c - 2 * k] = column[c - 2 * k]; shared[c - k] = column[c - k]; }
+    for (int64_t c = 0; c < n; c += LANES) {
+        invert_columns(n, matrix, c, c + LANES > 2 * k ? 0 : c, column);
+        for (int64_t i = c, q = 0; q < LANES && i < n; i++, q++) {
+            variance[i] = column[i][q];
+            is_flat &= variance[i] * gram[i * rows + i] < STEEP && variance[i] > 0;
+            if (i / k == 2) { shared[i - 2 * k] = column[i - 2 * k][q]; shared[i - k] = column[i - k][q]; }
+        }
     }
     return is_flat;
 }
@@ -358,6 +387,6 @@ static void describe_fit(const Settings *s, const Limits *limits, Work *work, So
     out->k = k; out->per = per; out->converged = work->fit.converged; out->cost = work->fit.cost;
     memcpy(out->parameters, work->fit.parameters, per * k * sizeof(double));
     memset(out->at_bound, 0, k);
-    for (int64_t i = 0; i < per * k; i++)
-        out->at_bound[i % k] |= out->parameters[i] <= limits->low[i / k] || out->parameters[i] >= limits->high[i / k];
+    for (int64_t q = 0, i = 0; q < per; q++)
+        for (int64_t j = 0; j < k; j++, i++) out->at_bound[j] |= out->parameters[i] <= limits->low[q] || out->parameters[i] >= limits->high[q];
 }

@@ -29,6 +29,13 @@ INLINE double at_most(double value, double bound) { return value < bound ? value
 
 INLINE float sum_lanes(lanes v) { return (v[0] + v[2]) + (v[1] + v[3]); }
 
+/* `sum_lanes` of four at once. */
+INLINE lanes sum_four(lanes a, lanes b, lanes c, lanes d) {
+    const lanes one = (lanes){a[0], b[0], a[1], b[1]} + (lanes){a[2], b[2], a[3], b[3]};
+    const lanes two = (lanes){c[0], d[0], c[1], d[1]} + (lanes){c[2], d[2], c[3], d[3]};
+    return (lanes){one[0], one[1], two[0], two[1]} + (lanes){one[2], one[3], two[2], two[3]};
+}
+
 /* The inner product of n vectors; once in float32, once in float64. */
 INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
     lanes sum = ALL(0);

@@ -39,8 +39,14 @@ static void hermite_moments(Work *work, const Fit *fit) {
         find_directions(w, time, inverse, row, 0, third, fourth);
         take_level_off(w, 1, third);
         take_level_off(w, 1, fourth);
-        work->h3[j] = multiply(n, third, residual) / sqrt(at_least(multiply(n, third, third), 1e-12)) / w->std;
-        work->h4[j] = multiply(n, fourth, residual) / sqrt(at_least(multiply(n, fourth, fourth), 1e-12)) / w->std;
+        lanes sum[4] = {{0}};
+        for (int64_t v = 0; v < n; v++) {
+            sum[0] += third[v] * residual[v]; sum[1] += third[v] * third[v];
+            sum[2] += fourth[v] * residual[v]; sum[3] += fourth[v] * fourth[v];
+        }
+        const lanes product = sum_four(sum[0], sum[1], sum[2], sum[3]);
+        work->h3[j] = product[0] / sqrt(at_least(product[1], 1e-12)) / w->std;
+        work->h4[j] = product[2] / sqrt(at_least(product[3], 1e-12)) / w->std;
     }
 }
 

@@ -48,15 +48,17 @@ INLINE void gather_stacked(const Stacked *s, const double *p, const double *z, c
         }
     }
     for (int64_t i = 0; i < s->n; i++) rows[i * stride + size] = -rest[i];
-    for (int64_t a = 0; a <= size; a += 2)
-        for (int64_t b = 0; b < size && b <= a + 1; b += 2 * LANES) {
-            wide sum[4] = {{0}};
+    for (int64_t a = 0; a <= size; a += 4)
+        for (int64_t b = 0; b < size && b <= a + 3; b += 2 * LANES) {
+            wide sum[8] = {{0}};
             for (const double *row = rows; row < rows + s->n * stride; row += stride) {
                 const wide low = *(const wide *)(row + b), high = *(const wide *)(row + b + LANES);
                 sum[0] += row[a] * low; sum[1] += row[a] * high;
                 sum[2] += row[a + 1] * low; sum[3] += row[a + 1] * high;
+                sum[4] += row[a + 2] * low; sum[5] += row[a + 2] * high;
+                sum[6] += row[a + 3] * low; sum[7] += row[a + 3] * high;
             }
-            for (int64_t q = 0; q < 4 * LANES; q++) {
+            for (int64_t q = 0; q < 8 * LANES; q++) {
                 const int64_t i = a + q / (2 * LANES), j = b + q % (2 * LANES);
                 if (i == size && j < size) downhill[j] = sum[q / LANES][q % LANES];
                 if (i < size && j <= i) normal[i * size + j] = sum[q / LANES][q % LANES];
