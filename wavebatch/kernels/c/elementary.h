@@ -1,8 +1,8 @@
 /* Elementary functions and small systems of equations for Python: NumPy's depend on the processor and on its BLAS. */
 
 INLINE int64_t exponentials_any(int64_t n, const double *x, double *out) {
-    int64_t i = 0;
-    for (; i + LANES <= n; i += LANES) *(wide *)(out + i) = exp_wide(*(const wide *)(x + i));
+    int64_t i = has_sixteen ? exponentials_eight(n, x, out) : 0;
+    i += exponentials_wide(n - i, x + i, out + i);
     for (; i < n; i++) out[i] = exp_double(x[i]);
     return 0;
 }

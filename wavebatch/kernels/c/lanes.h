@@ -63,22 +63,19 @@ INLINE lanes log1p_lanes(lanes a) {
     return pick(rounded == 0.f, a, log_lanes(one) * a / pick(rounded == 0.f, ALL(1), rounded));
 }
 
-/* The same two in double precision, error 2e-16 of the value: NumPy's depend on the processor. The sum with 1.5 * 2^52
-   rounds to a whole number n and has it in its last bits; the factors are 1 / i!. */
-INLINE wide exp_wide(wide a) {
-    static const double FACTOR[] = {1.0 / 6227020800, 1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320,
-                                    1.0 / 5040, 1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 1.0 / 2, 1, 1};
-    wide_bits in_range = (a > -708) & (a <= 709);
-    wide inside = (wide)((wide_bits)a & in_range), whole = inside * 1.4426950408889634 + 6755399441055744.0, n = whole - 6755399441055744.0;
-    wide r = inside - n * 6.93147180369123816490e-01 - n * 1.90821492927058770002e-10, sum = {0};
-    for (int i = 0; i < 14; i++) sum = sum * r + FACTOR[i]; /* e^r, |r| <= ln(2) / 2, by Horner */
-    wide value = sum * (wide)(((wide_bits)whole + 1023) << 52), beyond = (wide)((a > 709) & (wide_bits)((wide){0} + INFINITY));
-    wide other = (wide)(((wide_bits)a & (a != a)) | ((wide_bits)beyond & (a == a)));
-    return (wide)((in_range & (wide_bits)value) | (~in_range & (wide_bits)other));
-}
+#define ROW wide
+#define BITS wide_bits
+#define OF(name) name##_wide
+#define TARGET
+#include "exponential.h"
+#undef ROW
+#undef BITS
+#undef OF
+#undef TARGET
 
 static double exp_double(double a) { return exp_wide((wide){a})[0]; }
 
+/* ln a in double precision, error 2e-16 of the value. */
 static double log_double(double a) {
     if (!(a > 0) || a == INFINITY) return a == 0 ? -INFINITY : a > 0 ? a : NAN;
     int extra = a < 2.2250738585072014e-308 ? 54 : 0; /* of numbers below the normal ones */

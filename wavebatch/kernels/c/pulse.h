@@ -46,6 +46,16 @@ typedef int32_t sixteen_bits __attribute__((vector_size(64), aligned(16), may_al
 #define OF(name) name##_sixteen
 #define TARGET __attribute__((target("avx512f,avx512dq")))
 #include "gaussians.h"
+#undef ROW
+#undef BITS
+#undef OF
+
+typedef double eight __attribute__((vector_size(64), aligned(8)));
+typedef int64_t eight_bits __attribute__((vector_size(64), aligned(8)));
+#define ROW eight
+#define BITS eight_bits
+#define OF(name) name##_eight
+#include "exponential.h"
 
 static int has_eight, has_sixteen;             /* whether processor and system have AVX2, and AVX-512 */
 
@@ -60,6 +70,7 @@ __attribute__((constructor)) static void look_for_vectors(void) {
 enum { has_eight = 0, has_sixteen = 0 };
 #define add_gaussians_octet add_gaussians_lanes
 #define add_gaussians_sixteen add_gaussians_lanes
+#define exponentials_eight exponentials_wide
 #define AVX2
 #endif
 
