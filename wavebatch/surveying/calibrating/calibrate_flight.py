@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -410,6 +411,11 @@ def calibrate_flight(
         # All energies count relative to those of the first strip: the mean of each would hide what lasers lose.
         before = Calibration(1.0, 0.0, **strips[0].sent.describe()) if strips else None
         strips.append(read_strip(path, i, boxes, targets, replace(options, before=before)))
+    for kept, copy in combinations(strips, 2):
+        same = np.intersect1d(kept.ties["light"], copy.ties["light"])
+        if 2 * len(same) > max(len(kept.ties), 1):
+            problem = f"its echoes are those of {kept.path.name}: a copy proves nothing"
+            raise InputError(f"{copy.path}: {problem}; leave it out")
     good = [strip.found for strip in strips if strip.found is not None]
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))

@@ -179,14 +179,15 @@ and chance that echoes at random places leave it: thirty of them leave a quarter
 LEAST_NEGATIVE, MOST_REFLECTANCE, BRIGHT = 0.01, 1.5, 0.1
 """Share of negative values from which a column of reflectances is in dB; most that surfaces send back along the light:
 white ones half more than a matt one; and share of values above that from which it is no reflectance. Backscatter
-coefficients are four times as large."""
+coefficients are four times as large; amplitudes over full scale (dB) are hundreds of times too small."""
 
 MOST_AIR_ERROR = 0.3
 """Error of the share of the air that a column holds from which the share is not known: it is 0 or 1. Beyond -0.5 and
 1.5 something else changes with the range."""
 
-CLASSES = 5
-"""Classes of reflectance whose constants are compared."""
+CLASSES, MOST_POWER = 5, 2.0
+"""Classes of reflectance whose constants are compared; and the most by which the logarithm of the constant may change
+with that of the column: 1 for the root of the reflectance, 2 for its third root."""
 
 
 def measure_target(
@@ -320,20 +321,26 @@ def measure_column(
     rows, facing = rows[facing > LEAST_REFLECTANCE], facing[facing > LEAST_REFLECTANCE]
     blank = TargetResult(f"column {name}", float(np.median(facing)) if len(facing) else 0.0, len(rows))
     bright = float(np.mean(facing > MOST_REFLECTANCE)) if len(facing) else 0.0
-    if len(rows) < LEAST_ECHOES or bright > BRIGHT:
+    if len(rows) < LEAST_ECHOES or bright > BRIGHT or blank.reflectance < DARKEST:
         reason = f"{len(rows)} clean single echoes have a reflectance, {LEAST_ECHOES} are needed"
         if len(rows) >= LEAST_ECHOES:
-            reason = f"its median is {blank.reflectance:.3g}, {bright:.0%} exceed {MOST_REFLECTANCE:g}, as no surface "
-            reason += "does: no reflectance in dB (below 0), nor as a share of 1"
+            reason = f"its median is {blank.reflectance:.3g}, {bright:.0%} exceed {MOST_REFLECTANCE:g}, as no surfaces "
+            reason += "have: no reflectance in dB (below 0), nor as a share of 1"
         return replace(blank, refused=reason), rows[:0], np.empty(0)
     constant, left, air_err = _take_off_air(4.0 * facing / rows["light"], rows["distance"], attenuation)
     result = replace(summarise(blank, constant), air=left)
     # By both: classes of one alone differ where that one is noisy.
     order = np.argsort(facing * rows["light"], kind="stable")
-    classes = np.array_split(constant[order], min(CLASSES, len(rows) // LEAST_ECHOES))
-    apart = float(np.std([np.median(some) for some in classes])) / (result.constant or 1.0)
+    number = min(CLASSES, len(rows) // LEAST_ECHOES)
+    apart, steps = (
+        float(np.std([np.log(np.median(some)) for some in np.array_split(of[order], number)]))
+        for of in (constant, facing)
+    )
+    # A power of the reflectance, as another factor of dB makes it, is right where it is 1: how far it is from there.
+    power = min(apart / max(steps, 1e-9), MOST_POWER) if apart > MOST_APART else 0.0
+    far = math.expm1(max(apart, power * abs(math.log(blank.reflectance))))
     inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(len(rows) - 1)
-    error = float(np.sqrt(reflectance_error**2 + apart**2 + inner**2 + air_err**2))
+    error = float(np.sqrt(reflectance_error**2 + far**2 + inner**2 + air_err**2))
     return replace(result, relative_error=error, apart=apart), rows, constant
 
 
