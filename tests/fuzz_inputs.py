@@ -127,7 +127,7 @@ voxelize {base}/strip.las -o {out}/a.npz --size 1 --calibration {base}/cal.toml 
     "energy.txt": "run {base}/strip.las -o {out} --energy {input} --calibration {base}/cal.toml --profile fast",
     "targets.geojson": """
 calibrate {base}/strip.las --targets {input} -o {out}/c.toml --flight-height 500
-calibrate {base}/strip.las {base}/packed.laz --targets {input} -o {out}/c.toml --flight-height 500
+calibrate {base}/strip.las {base}/other.las --targets {input} -o {out}/c.toml --flight-height 500
 """,
     "targets.csv": "calibrate {base}/strip.las --targets {input} -o {out}/c.toml --flight-height 500",
     "polygons.geojson": f"""
