@@ -19,6 +19,7 @@ from wavebatch.batch.report_file import LEAST_JUDGED, MOST_FAILED, find_remarks,
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import WARNINGS, StripWarning
 from wavebatch.files.las.header import read_header
+from wavebatch.tools.simulate import simulate_strip
 
 
 def remarks(strip, folder):
@@ -221,6 +222,21 @@ def test_a_forced_survey_and_records_that_are_lost_have_their_codes(prepared):
     forced = replace(prepared, forced="its noise is 3 DN")
     found = find_warnings(forced, RunReport(counts=counts), (), {"GDAL 7": "too long"})
     assert [one.code for one in found] == ["forced-system", "dropped-records"]
+
+
+@pytest.mark.parametrize(("scene", "kind", "said"), [("forest", 2, True), ("forest", 0, False), ("flat", 2, False)])
+def test_echoes_beside_points_of_the_ground_alone_are_said_to_have_its_class(scene, kind, said, tmp_path, edit_points):
+    """Who keeps class 2 only has no crowns among the points, but in the packets.
+
+    kind: the class of all points, or 0 for those of the scene.
+    """
+    strip = tmp_path / "strip.las"
+    simulate_strip(scene, strip, pulses=1500, seed=2)
+    edit_points(strip, strip, **({"raw_classification": kind} if kind else {}))
+    report = run_one(strip, tmp_path / "out").report
+    assert (report.ground_points == report.count("points_in")) == bool(kind)
+    lines = [one.text for one in report.warnings if one.code == "ground"]
+    assert len(lines) == said and all(f"{report.flags['ADDED']} added echoes" in line for line in lines)
 
 
 @pytest.mark.parametrize(

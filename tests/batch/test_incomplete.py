@@ -138,6 +138,7 @@ def test_reports_merge_in_any_order():
 
 def test_a_report_reads_back_from_its_json():
     report = _report() + RunReport(above_one=1, last_left_out=2, strayed_returns=256, unseen_returns=7, copied_echoes=3)
+    report += RunReport(ground_points=4)
     again = RunReport.from_json(json.loads(json.dumps(report.to_json())))
     assert again.to_json() == report.to_json() != _report().to_json()
     assert (again + report).to_json() == (report + report).to_json()

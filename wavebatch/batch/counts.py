@@ -80,7 +80,7 @@ WIDTH_BINS = LogBins(0.01, 0.01, 1200)
 """0.01 to 1600 ns, 1 % each."""
 _BINS = {"amplitude_dn": AMPLITUDE_BINS, "echo_width_ns": WIDTH_BINS}
 
-_NUMBERS = {name: name for name in ("copied_echoes", "strayed_returns", "unseen_returns")}
+_NUMBERS = {name: name for name in ("copied_echoes", "ground_points", "strayed_returns", "unseen_returns")}
 _NUMBERS |= {"above_one": "reflectance_above_one", "last_left_out": "last_echoes_left_out"}
 """Numbers of the quality of a report: field, and key of the file."""
 
@@ -109,6 +109,8 @@ class RunReport:
     """Returns with an intensity whose packet holds no echo at all."""
     copied_echoes: int = 0
     """Echoes that do not count, because another packet of their pulse has them too."""
+    ground_points: int = 0
+    """Points of the strip of class 2."""
     remarks: tuple[str, ...] = ()
     """Lines about the strip as a whole, from `report_file`."""
     warnings: tuple[StripWarning, ...] = ()

@@ -21,7 +21,7 @@ from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_whole_records, widen_integers
-from wavebatch.files.las.header import locate, read_scanner, split_numbers
+from wavebatch.files.las.header import GROUND, locate, read_classes, read_scanner, split_numbers
 from wavebatch.kernels.geometry.group_returns import (
     along_ray,
     find_nearest,
@@ -523,6 +523,7 @@ def _count(
         passed_through=count_flags(reason),
         no_data=count_reasons(table.attributes),
         above_one=int(np.count_nonzero(above)),
+        ground_points=int(np.count_nonzero(read_classes(unit.points) == GROUND)),
         strayed_returns=STRETCH * int(np.count_nonzero(parts < STRAYED)),
         unseen_returns=int(np.count_nonzero(source["intensity"][inside & ~has_echoes])),
     )

@@ -282,6 +282,10 @@ MOST_CUT = 0.08
 """Share of echoes at the edge of their packet that a user must know of: 6 % in packets that are cut to their signal
 (NEON), 0 to 2 % on other real strips; 9 to 14 % where haze begins a fifth of the packets, all of it false."""
 
+MOST_ON_GROUND = 0.01
+"""Share of added echoes from which points that are all ground are said to have lost the others: of simulated bare
+ground it is .0014."""
+
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
 
@@ -564,6 +568,15 @@ def find_warnings(
             f"survey's pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
         )
         found += warn("false-echoes", [line])
+    # Points of one class may be those that a filter kept; their packets have all echoes of the pulse.
+    added = report.flags.get("ADDED", 0)
+    if report.ground_points == points and added >= LEAST_JUDGED and added > MOST_ON_GROUND * written:
+        line = (
+            f"all {points} points are ground (class 2), and so {added} added echoes have this class, though they may "
+            "be plants or buildings that were taken out: classify the cloud anew, or leave them out with --drop-flags "
+            "ADDED"
+        )
+        found += warn("ground", [line])
     found += warn("no-value", missed)
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))

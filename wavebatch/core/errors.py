@@ -57,6 +57,7 @@ WARNINGS = {
     "forced-system": "the survey of --system contradicts the strip",
     "false-echoes": "the chain that was asked for does not fit the pulse: many of its echoes are false",
     "failed-fits": "far more fits than usual did not converge, or ended at a bound",
+    "ground": "the strip has points of the ground only, so that all that its packets show beside them has its class",
     "no-value": "a column that --columns names has no value in the whole cloud",
     "calibration": "the calibration does not quite fit the strip, or its constant is less certain",
     "energy": "the energies of the pulses are not known as those of the calibration are",

@@ -383,6 +383,8 @@ _WAVE_FIELDS = frozenset(field_names(STANDARD_DTYPES[4])) - frozenset(field_name
 ANGLE_UNIT = 0.006
 """Degrees per count of `scan_angle` in formats 6-10; `scan_angle_rank` of formats 0-5 counts whole degrees."""
 _OVERLAP_CLASS = 12
+GROUND = 2
+"""Class of the ground."""
 
 CLASS_NAMES = {
     0: "never classified", 1: "unclassified", 2: "ground", 3: "low vegetation", 4: "medium vegetation",

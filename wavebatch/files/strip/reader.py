@@ -23,7 +23,7 @@ from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
 from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
-from wavebatch.files.las.header import locate, read_classes, read_scanner, split_numbers
+from wavebatch.files.las.header import GROUND, locate, read_classes, read_scanner, split_numbers
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check, scanner
 from wavebatch.files.strip.packets import BLOCK_BYTES, PacketFile, StripFacts, find_facts
@@ -457,9 +457,9 @@ LEAST_PAIRS, SCALE_SPREAD, BENT = 20, 0.05, 0.1
 """Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles; and by
 how much, over their distance, returns of one pulse may be off its ray: their times may be rounded to samples."""
 
-GROUND, FINE_HEIGHTS = 2, 0.01
-"""Class of points of the ground; and largest step of heights of which most are 0 by normalisation only: measured ground
-scatters by more, but in steps of .1 m a polder is level at 0."""
+FINE_HEIGHTS = 0.01
+"""Largest step of heights of which most are 0 by normalisation only: measured ground scatters by more, but in steps of
+.1 m a polder is level at 0."""
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """What steps through a strip have over a whole number, the next smaller one: those that are whole see one sensor only
