@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.text_file import write_text
@@ -241,7 +241,8 @@ def search_misfit(monkeypatch, cost, loud, change, whitening=()):
     monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
     monkeypatch.setattr(choose_pulse, "_explain_between", explain_between)
     block, system = record(gaussian, 5, n=100)[0], SystemPulse(2.0, noise=ReceiverNoise(whitening=whitening))
-    return *choose_pulse._choose_misfit(block, system, 0.0, change)[:2], looked
+    found, doubt, _ = choose_pulse._choose_misfit(block, lambda misfit: replace(system, misfit=misfit), 0.0, change)
+    return found.misfit, doubt, looked
 
 
 def test_no_misfit_is_looked_for_below_none(monkeypatch):
@@ -419,7 +420,7 @@ def test_the_misfit_is_at_least_what_the_pulse_misses_of_the_stack():
     block = record(gaussian, 5, n=400)[0]
     system = survey_block(block, learn=False).system
     for missed in (0.0, 0.02):
-        found, _, _ = settle(block, system, 0.0, missed)
+        found, _, _ = settle(block, system, EchoTable.build([], [], [], []), 0.0, missed)
         assert found.misfit == missed
 
 

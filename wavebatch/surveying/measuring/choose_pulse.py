@@ -7,13 +7,14 @@ that it was not learned from are shorter to describe with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, quantile
 from wavebatch.core.units import FWHM_PER_SIGMA
@@ -36,7 +37,7 @@ from wavebatch.surveying.measuring.judge import (
     sample_noise,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, count_holes, look_in_mirror
-from wavebatch.surveying.measuring.misfit import LEAST_MISFIT
+from wavebatch.surveying.measuring.misfit import LEAST_MISFIT, limit_faint
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, spread_rows, thin_block
 from wavebatch.surveying.systems.known_systems import MOST_SPREAD
 from wavebatch.surveying.systems.survey_result import Tried
@@ -520,7 +521,12 @@ def _beats(shorter: Candidate, longer: Candidate) -> bool:
 
 
 def settle(
-    block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0, change: float = 0.0
+    block: WaveformBlock,
+    system: SystemPulse,
+    echoes: EchoTable,
+    seen: float = 1.0,
+    missed: float = 0.0,
+    change: float = 0.0,
 ) -> tuple[SystemPulse, Mirror, float]:
     """Choose the misfit by the length of descriptions, then raise the significance until noise adds no echoes.
 
@@ -530,6 +536,8 @@ def settle(
         Cleaned waveforms.
     system : SystemPulse
         With the pulse that the judge chose.
+    echoes : EchoTable
+        Of a sample, decomposed with this pulse.
     seen : float
         Change of the pulse from shot to shot that its strongest echoes show, as a share of the amplitude.
     missed : float
@@ -540,7 +548,7 @@ def settle(
     Returns
     -------
     system : SystemPulse
-        With `misfit` and `significance`.
+        With `misfit`, the `faint_share` that goes with it, and `significance`.
     mirror : Mirror
         Echoes of mirrored residuals that are left.
     doubt : float
@@ -550,8 +558,12 @@ def settle(
     # What clipped echoes hide is no misfit, and has no mirror.
     whole = np.flatnonzero((part.samples < clip_level(part, system)).all(axis=1))
     part = part.rows(whole) if len(whole) >= FEWEST else part
-    misfit, doubt, explained = _choose_misfit(part, system, seen, change, missed)
-    system = replace(system, misfit=misfit)
+
+    def at(misfit: float) -> SystemPulse:
+        """What a misfit leaves beside strong echoes is tried with it: else it explains faint targets."""
+        return limit_faint(replace(system, misfit=misfit), max(seen, LEAST_MISFIT), echoes)
+
+    system, doubt, explained = _choose_misfit(part, at, seen, change, missed)
     harder = np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER)
     tried = []
     for significance, mirror in look_in_mirror(part, system, explained, [0.0, *map(float, harder)]):
@@ -572,10 +584,10 @@ def settle(
 
 
 def _choose_misfit(
-    block: WaveformBlock, system: SystemPulse, seen: float, change: float, missed: float = 0.0
-) -> tuple[float, float, Explained]:
-    """The least misfit that describes in at most one standard error more than the shortest, or the shortest where fits
-    are whitened; its doubt, and its echoes.
+    block: WaveformBlock, at: Callable[[float], SystemPulse], seen: float, change: float, missed: float = 0.0
+) -> tuple[SystemPulse, float, Explained]:
+    """The system by `at` with the least misfit that describes in at most one standard error more than the shortest, or
+    the shortest where fits are whitened; its doubt, and its echoes.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
     much of it neighbours are not found, and both lengthen the description. Where it begins to be as short, steps are
@@ -586,18 +598,16 @@ def _choose_misfit(
     changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
     found: dict[float, Looked] = {}
     lengths: dict[float, np.ndarray] = {}
-
-    def at(misfit: float) -> SystemPulse:
-        return replace(system, misfit=float(misfit))
+    plain = at(0.0)
 
     def look(*places: float) -> tuple[float, list[float]]:
         """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
         for place in places:
             if place not in found:
-                found[place] = _explain_between(block, at(MISFITS[0] * 2.0**place), changes, found, place)
+                found[place] = _explain_between(block, at(float(MISFITS[0] * 2.0**place)), changes, found, place)
             if place not in lengths:
                 looked = found[place]
-                lengths[place] = describe_waveforms(block, system, looked.explained, changes, looked.left)
+                lengths[place] = describe_waveforms(block, plain, looked.explained, changes, looked.left)
         tried = product(sorted(lengths), range(len(changes)))
         best, change = min(tried, key=lambda one: lengths[one[0]][one[1]].mean())
         least = lengths[best][change]
@@ -608,7 +618,7 @@ def _choose_misfit(
     middle = 6 if COVERED * change > MISFITS[5] else 2
     for end in (0, len(MISFITS) - 1):
         if middle == 2:  # the largest is nearly always looked at, and few waveforms lie between the two
-            found[end] = _explain_between(block, at(MISFITS[end]), changes, found, end)
+            found[end] = _explain_between(block, at(float(MISFITS[end])), changes, found, end)
     best, longer = look(middle - 2, middle + 2, middle)
     while longer[0] < SURE and min(lengths) > 0:
         best, longer = look(min(lengths) - 2)
@@ -623,7 +633,7 @@ def _choose_misfit(
         best, longer = look(min(lengths) - 1)
     places, misfit = sorted(lengths), 0.0
     # A filter for noise makes echoes of what the pulse lacks: with less misfit than the best, whitened fits add them.
-    most = 0.0 if system.noise.whitening else 1.0
+    most = 0.0 if plain.noise.whitening else 1.0
     while longer[0] > most:
         first = next(place for place, errors in enumerate(longer) if errors <= most)
         (before, after), (over, under) = places[first - 1 : first + 1], longer[first - 1 : first + 1]
@@ -640,7 +650,7 @@ def _choose_misfit(
     allowed = between[np.interp(between, places, longer) <= SURE]
     misfit = max(misfit, min(missed, float(MISFITS[0] * 2.0 ** max(allowed, default=0.0))))
     place = float(np.log2(max(misfit / MISFITS[0], 1.0)))  # none is taken where the least one was looked at
-    return misfit, doubt, _explain_between(block, at(misfit), changes, found, place).explained
+    return at(misfit), doubt, _explain_between(block, at(misfit), changes, found, place).explained
 
 
 class Looked(NamedTuple):
