@@ -1,6 +1,8 @@
 """Runs for tests: a strip through a profile in this process, and what came out."""
 
 import json
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import laspy
@@ -47,3 +49,11 @@ def is_alive(pid) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def wait_until(true: Callable[[], bool], what: str = "") -> None:
+    """Wait until it is true; on a busy machine that may take minutes."""
+    deadline = time.monotonic() + 300
+    while not true():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.01)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -14,7 +17,7 @@ from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.systems.known_systems import draw_pulse
 from wavebatch.surveying.systems.survey_result import Survey
-from wavebatch.tools.simulate import Scene, find_scene, simulate_blocks
+from wavebatch.tools.simulate import Scene, find_scene, simulate_blocks, simulate_strip
 
 CANOPY_SAMPLES, CANOPY_BEGIN, CANOPY_SIGMA, CANOPY_NOISE = 60, 5, 2.0, 1.2
 
@@ -28,6 +31,18 @@ def make_scene(name: str, **recording) -> Scene:
 def make_block(scene: str | Scene, n: int, seed: int = 0) -> tuple[WaveformBlock, EchoTable]:
     """One block of n waveforms and its truth."""
     return next(simulate_blocks(scene, n, seed=seed, size=n))
+
+
+def simulated(name: str, scene: str | Scene, *, pulses: int, seed: int, **options: Any) -> Callable:
+    """A fixture of a test module: a simulated strip in a file of this name; options: of `simulate_strip`."""
+
+    @pytest.fixture(scope="module")
+    def strip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        path = tmp_path_factory.mktemp("simulated") / name
+        simulate_strip(scene, path, pulses=pulses, seed=seed, **options)
+        return path
+
+    return strip
 
 
 def survey_file(path: Path) -> Survey:

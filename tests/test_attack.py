@@ -4,11 +4,11 @@ import os
 import re
 import sys
 import textwrap
-import time
 
 import attacking
 import pytest
 from attacking import Attack, Attacker
+from batch_tools import wait_until
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks at processes through /proc")
 
@@ -36,10 +36,8 @@ class Planted(Attacker):
 
     def _start(self, *places):
         """The process, once it does not die of the signal: on a busy machine that takes a while."""
-        process, deadline = super()._start(*places), time.monotonic() + 300
-        while process.poll() is None and not attacking.handles_signals(process.pid):
-            assert time.monotonic() < deadline, "the program does not begin"
-            time.sleep(0.01)
+        process = super()._start(*places)
+        wait_until(lambda: process.poll() is not None or attacking.handles_signals(process.pid))
         return process
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from batch_tools import read_outputs
+from batch_tools import read_outputs, wait_until
 from commands import run_command
 
 from wavebatch.batch.workers import dask_cluster
@@ -37,7 +37,7 @@ class Dask:
         self.scheduler = self._start(
             *_SCHEDULER, "--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file), *more
         )
-        self.wait_until(lambda: file.exists() and file.stat().st_size)
+        wait_until(lambda: file.exists() and file.stat().st_size)
         self.address = json.loads(file.read_text())["address"]
 
     def client(self):
@@ -56,7 +56,7 @@ class Dask:
         common = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--memory-limit", "0")
         workers = [self._start(*_WORKER, self.address, *common, PYTHONPATH=path, **env) for _ in range(number)]
         logs = [self.folder / f"log{self.processes.index(worker)}" for worker in workers]
-        self.wait_until(lambda: all(b"Registered to" in log.read_bytes() for log in logs))
+        wait_until(lambda: all(b"Registered to" in log.read_bytes() for log in logs))
         return workers
 
     def _start(self, *command, **env):
@@ -65,12 +65,6 @@ class Dask:
             process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env=env)
         self.processes.append(process)
         return process
-
-    def wait_until(self, true):
-        deadline = time.monotonic() + 300
-        while not true():
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
 
     def stop(self):
         for process in reversed(self.processes):
@@ -263,7 +257,7 @@ def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, s
         process = subprocess.Popen(
             [*command, str(strips), "-o", str(out), "--scheduler", cluster.address], stderr=subprocess.PIPE, text=True
         )
-        cluster.wait_until(lambda: (out / "a.report.json").exists())
+        wait_until(lambda: (out / "a.report.json").exists())
         cluster.stop()
         if restarts:
             port = cluster.address.rpartition(":")[2]
@@ -288,7 +282,7 @@ def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path, t
     process = subprocess.Popen(
         [*command, "-o", str(tmp_path), "--scheduler", dask.address], stderr=subprocess.PIPE, text=True
     )
-    dask.wait_until(lambda: list(tmp_path.glob(".wavebatch-*.tmp")))
+    wait_until(lambda: list(tmp_path.glob(".wavebatch-*.tmp")))
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=300)
     go_on.touch()
@@ -376,7 +370,7 @@ def test_workers_that_join_later_take_part_and_replace_those_that_die(tmp_path, 
         with dask_cluster.Cluster(dask.address, tmp_path) as cluster:
             assert (cluster.jobs, cluster.limit) == (1, 2)
             second = dask.start_worker()
-            dask.wait_until(lambda: len(cluster._look()) == 2)
+            wait_until(lambda: len(cluster._look()) == 2)
             assert (cluster.jobs, cluster.limit) == (2, 4)
             (tmp_path / "met").mkdir()
             futures = [cluster.submit(_meet, tmp_path / "met", 2) for _ in range(8)]

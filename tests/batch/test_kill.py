@@ -4,11 +4,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from attacking import command_line, has_signal, list_children
-from batch_tools import is_alive, read_outputs
+from batch_tools import is_alive, read_outputs, wait_until
 from commands import run_command
 
 from wavebatch.tools.simulate import simulate_strip
@@ -125,14 +124,7 @@ def test_workers_die_with_their_parent(strips, tmp_path, stopped):
             os.kill(child, signal.SIGSTOP)
         process.send_signal(signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
-    _wait_until_gone(children)
-
-
-def _wait_until_gone(children):
-    deadline = time.monotonic() + 300
-    while any(is_alive(child) for child in children):
-        assert time.monotonic() < deadline, "a worker outlived its parent"
-        time.sleep(0.01)
+    wait_until(lambda: not any(map(is_alive, children)), "a worker outlived its parent")
 
 
 _WAITS = """
@@ -161,7 +153,7 @@ def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_p
             worker = next((one for one in workers if has_signal(one, "SigIgn", signal.SIGINT)), None)
         os.kill(worker, signal.SIGSTOP)
         process.send_signal(signal.SIGKILL)
-    _wait_until_gone([worker])
+    wait_until(lambda: not is_alive(worker), "a worker outlived its parent")
 
 
 _SHOT = """

@@ -11,20 +11,16 @@ import pytest
 from attacking import handles_signals
 from batch_tools import make_job
 from commands import refuses
+from helpers_scenes import simulated
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
 from wavebatch.files.disk.publish import Draft
-from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks at signals through /proc")
 
 
-@pytest.fixture(scope="module")
-def strip(tmp_path_factory):
-    path = tmp_path_factory.mktemp("strip") / "a.las"
-    simulate_strip("flat", path, pulses=3000, seed=1)
-    return path
+strip = simulated("a.las", "flat", pulses=3000, seed=1)
 
 
 def _start(command, *, code=None):

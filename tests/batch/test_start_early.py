@@ -3,10 +3,9 @@
 import os
 import subprocess
 import sys
-import time
 
 import pytest
-from batch_tools import is_alive
+from batch_tools import is_alive, wait_until
 
 EARLY = """
 import os, sys, time
@@ -33,10 +32,8 @@ def test_processes_that_were_started_for_nothing_end_with_their_parent(tmp_path,
     assert not done.stderr
     children = [int(word) for word in done.stdout.split()]
     assert len(children) >= 2
-    deadline = time.monotonic() + 300
-    while any(is_alive(child) for child in children):  # one of them is multiprocessing's own, which ends by itself
-        assert time.monotonic() < deadline, "a process stays"
-        time.sleep(0.01)
+    # One of them is multiprocessing's own, which ends by itself.
+    wait_until(lambda: not any(map(is_alive, children)), "a process stays")
 
 
 def test_wrong_options_end_a_run_of_several_jobs_as_usual(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from commands import run_command, succeed
-from helpers_scenes import make_scene
+from helpers_scenes import make_scene, simulated
 from html_tools import Page
 from strips import cut_strip
 
@@ -83,12 +83,8 @@ def _survey(*arguments):
     return run_command("survey", *arguments)
 
 
-@pytest.fixture(scope="module")
-def flat_strip(tmp_path_factory):
-    """2,500 pulses over bare ground."""
-    path = tmp_path_factory.mktemp("flat") / "flat.las"
-    simulate_strip("flat", path, pulses=2500, seed=1)
-    return path
+flat_strip = simulated("flat.las", "flat", pulses=2500, seed=1)
+"""2,500 pulses over bare ground."""
 
 
 @pytest.fixture(scope="module")
@@ -242,12 +238,8 @@ def voxelize(*arguments):
     return run_command("voxelize", *arguments)
 
 
-@pytest.fixture(scope="module")
-def strip(tmp_path_factory):
-    """600 pulses over streets and houses."""
-    path = tmp_path_factory.mktemp("voxelize") / "urban.las"
-    simulate_strip("urban", path, pulses=600, seed=5)
-    return path
+strip = simulated("urban.las", "urban", pulses=600, seed=5)
+"""600 pulses over streets and houses."""
 
 
 def test_counts_go_to_stdout_and_talk_to_stderr(strip, tmp_path):

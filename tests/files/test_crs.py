@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from batch_tools import run_one
 from commands import fail, refuses, run_command, succeed
+from helpers_scenes import simulated
 from hypothesis import given
 from hypothesis import strategies as st
 from strips import add_record, descriptor, make_raw, place_header, vlr
@@ -570,12 +571,8 @@ def test_so_do_synthetic_strips(strip, tmp_path):
 ZONE = build_utm(32633)
 
 
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    """A strip without a CRS."""
-    path = tmp_path_factory.mktemp("areas") / "plain.las"
-    simulate_strip("flat", path, pulses=400, seed=1)
-    return path
+plain = simulated("plain.las", "flat", pulses=400, seed=1)
+"""A strip without a CRS."""
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from batch_tools import run_one
 from commands import run_command, succeed
+from helpers_scenes import simulated
 from strips import descriptor, make_raw, read_all
 
 from wavebatch.core.echoes import EchoFlag
@@ -114,11 +115,7 @@ def cut(source, target, fill, shift=0):
     return target
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    path = tmp_path_factory.mktemp("gaps") / "whole.las"
-    simulate_strip("mixed", path, pulses=5000, seed=21, options=StripOptions(point_format=4))
-    return path
+whole = simulated("whole.las", "mixed", pulses=5000, seed=21, options=StripOptions(point_format=4))
 
 
 def read_block(path):
@@ -426,11 +423,7 @@ def mirror(source, target):
     return target
 
 
-@pytest.fixture(scope="module")
-def upright(tmp_path_factory):
-    path = tmp_path_factory.mktemp("form") / "up.las"
-    simulate_strip("mixed", path, pulses=2500, seed=3, options=StripOptions(point_format=4))
-    return path
+upright = simulated("up.las", "mixed", pulses=2500, seed=3, options=StripOptions(point_format=4))
 
 
 def test_inverted_waveforms_give_the_echoes_of_upright_ones(upright, tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from commands import fail, succeed
 from commands import run_command as call
+from helpers_scenes import simulated
 from strips import true_sensor, write_positions
 
 from wavebatch.core.units import MAD_TO_STD
@@ -22,7 +23,7 @@ from wavebatch.surveying.calibrating.calibration_files import (
     parse_calibration,
 )
 from wavebatch.surveying.calibrating.strip_echoes import CLEAN_ECHO
-from wavebatch.tools.simulate import find_scene, simulate_strip, strip
+from wavebatch.tools.simulate import find_scene, strip
 from wavebatch.tools.simulate.render import EAST, GROUND, NORTH, START_TIME
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
 
@@ -76,12 +77,8 @@ def test_normals_are_not_bent_by_outliers():
     assert abs(normal @ np.array([-0.5, 0, 1]) / np.sqrt(1.25)) == pytest.approx(1.0, abs=1e-4)
 
 
-@pytest.fixture(scope="module")
-def ground(tmp_path_factory):
-    """Flat ground whose echoes all are of one target."""
-    path = tmp_path_factory.mktemp("ground") / "flat.las"
-    simulate_strip("flat", path, pulses=6000, seed=8)
-    return path
+ground = simulated("flat.las", "flat", pulses=6000, seed=8)
+"""Flat ground whose echoes all are of one target."""
 
 
 def test_targets_get_their_reflectance_back(tmp_path, ground):

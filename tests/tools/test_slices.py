@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from commands import run_command, succeed
+from helpers_scenes import simulated
 from strips import cut_strip
 
 from wavebatch.cli.geometry import slice_
@@ -26,12 +27,8 @@ FLIGHT = FlightLine(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
 PULSES = 4000
 
 
-@pytest.fixture(scope="module")
-def strip(tmp_path_factory):
-    """Four scan lines of 1000 pulses over facets of 0 to 40 degrees, 40 m wide."""
-    path = tmp_path_factory.mktemp("slices") / "slope.las"
-    simulate_strip(replace(find_scene("slope"), flight=FLIGHT), path, pulses=PULSES, seed=6)
-    return path
+strip = simulated("slope.las", replace(find_scene("slope"), flight=FLIGHT), pulses=PULSES, seed=6)
+"""Four scan lines of 1000 pulses over facets of 0 to 40 degrees, 40 m wide."""
 
 
 def read_all(path, unit_points=None, **sizes):
