@@ -16,12 +16,13 @@ def _run() -> None:
     import sys
 
     # The null device where stdin, stdout or stderr are closed, as daemons and `2>&-` do. Else the first file that is
-    # opened would get their number, and the messages of a library would go into it.
+    # opened would get their number, and the messages of a library would go into it. As stdout it can only be read, so
+    # that a result for which there is no place is an error, as on a full disk.
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
+            os.open(os.devnull, os.O_RDONLY if number == 1 else os.O_RDWR)  # the lowest number that is free: this one
         if getattr(sys, name) is None:
             mode = "w" if number else "r"
             setattr(sys, name, open(number, mode, errors="backslashreplace", closefd=False))  # noqa: SIM115

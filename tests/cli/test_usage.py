@@ -109,14 +109,17 @@ def test_strips_without_points_pass_through_every_stage(place):
     assert "nan" not in shown and "completeness      no-data\ncorrectness       no-data\n" in shown
 
 
-@pytest.mark.quick_cases("--help", "check strip.las --json")
+@pytest.mark.quick_cases("*--help", "*check strip.las --json")
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is full")
 @pytest.mark.parametrize("words", ["--help", "info strip.las", "check strip.las --json", "stats strip.las", "stages"])
-def test_a_full_stdout_is_named(place, words):
-    with open("/dev/full", "wb") as full:
-        done = subprocess.run([sys.executable, "-m", "wavebatch", *words.split()], stdout=full, stderr=subprocess.PIPE,
-                              text=True, check=False)  # fmt: skip
-    assert (done.returncode, done.stderr) == (1, "error: stdout: cannot be written: No space left on device\n")
+@pytest.mark.parametrize(
+    ("to", "problem"), [("/dev/full", "No space left on device"), ("&-", "Bad file descriptor")], ids=["full", "closed"]
+)
+def test_a_stdout_that_cannot_be_written_is_named(place, words, to, problem):
+    """A result went nowhere with exit code 0 where a service or a script had closed stdout."""
+    command = f"'{sys.executable}' -m wavebatch {words} >{to}"
+    done = subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, f"error: stdout: cannot be written: {problem}\n")
 
 
 @pytest.mark.parametrize("words", ["--help", "info strip.las", "check strip.las --json", "stats strip.las"])

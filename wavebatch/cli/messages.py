@@ -155,9 +155,10 @@ class WrongUsage(_OneLine):
 
 
 class Unprinted(_OneLine):
-    """stdout that cannot be written, such as a full disk, as one line."""
+    """stdout that cannot be written, such as a full disk, as one line; what is left for it is dropped."""
 
     def __init__(self, error: OSError) -> None:
+        _drop_output(sys.stdout)
         super().__init__(f"stdout: cannot be written: {error.strerror or error}")
 
 
@@ -270,7 +271,6 @@ def print_text(text: str) -> None:
     except BrokenPipeError:
         raise
     except OSError as error:
-        _drop_output(sys.stdout)
         raise Unprinted(error) from error
 
 
