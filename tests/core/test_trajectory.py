@@ -128,6 +128,7 @@ def write_text(path, head, mark, order, time, xyz, extra=()):
         ("z\ty\tx\tGPS Time (s)", "\t", "zyxt"),
         ('"H (m)","N (m)","E (m)","sow"\n(m),(m),(m),(s)', ",", "zyxt"),
         ("time,status,x,y,z", ",", "tzxyz"),
+        ('"time","x","y","z"', '","', "txyz"),
         ("  TIME, EASTING, NORTHING, ELLIPSOID HEIGHT\n (sec), (m), (m), (m)", ",", "txyz"),
     ],
 )

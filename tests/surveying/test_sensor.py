@@ -161,6 +161,18 @@ def test_a_trajectory_of_something_else_is_refused(tmp_path, wide_strip, change,
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("speed", "said"), [(0.0, "moves by 0.0 m"), (0.4, r"moves by \d+\.\d m"), (1.0, "")])
+def test_a_trajectory_that_stands_still_is_refused_as_such(tmp_path, wide_strip, speed, said):
+    """It was 9 m off "as if its clock were off by -1.4e11 s"."""
+    time = START_TIME + np.arange(-1.0, 3.0, 0.05)
+    slow = START_TIME + 0.28 + speed * (time - START_TIME - 0.28)
+    path = write_positions(tmp_path / "t.csv", time, true_sensor(slow))
+    if said:
+        refuses(InputError, f"{said} during the strip, but the packets' vectors", find, wide_strip, trajectory=path)
+    else:
+        find(wide_strip, trajectory=path)
+
+
 def test_pairs_of_returns():
     time = START_TIME + np.sort(np.random.default_rng(1).uniform(0.0, 3.0, 8000))
     rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * 1e5)

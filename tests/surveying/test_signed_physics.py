@@ -241,9 +241,9 @@ def flickering(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shots")
     flight = Flight(energy_spread=0.08, store_energy=True)
     truth = write_strip(folder / "strip.las", [Plane()], flight, 6000)
-    lines = [f"{time:.9f},{energy:.9f}" for time, energy in zip(truth.gps_time, 7.5 * truth.energy, strict=True)]
-    # Units may have spaces, and columns after those that count may be empty.
-    header = "time [GPS s],energy [nJ of a shot],temperature (deg C)\n"
+    lines = [f'"{time:.9f}",{energy:.9f}' for time, energy in zip(truth.gps_time, 7.5 * truth.energy, strict=True)]
+    # Units may have spaces, columns after those that count may be empty, and fields may be quoted.
+    header = "\"time [GPS s]\",energy [nJ of a shot],temperature (deg C)\n"
     (folder / "shots.csv").write_text(header + "\n".join(f"{line},{'20' * (i % 2)}" for i, line in enumerate(lines)))
     return folder, flight, truth
 

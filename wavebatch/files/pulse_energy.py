@@ -168,7 +168,8 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
         if not Path(name).is_file():
             hint = name_columns(reader, name)
             raise InputError(f"{path}: --energy: no extra byte and no file is called {name!r}; {hint}")
-        lines = [line for line in read_text(name, "file of pulse energies", 1 << 30).splitlines() if line.strip()]
+        text = read_text(name, "file of pulse energies", 1 << 30).replace('"', "")
+        lines = [line for line in text.splitlines() if line.strip()]
         lines[:1] = [re.sub(r"[\[(][^\])]*[\])]", " ", line.casefold()) for line in lines[:1]]  # units, as in time [s]
         # A name may have spaces, and a value may be missing: neither moves the columns after it.
         rows = [re.split("[,;]", line) if "," in line or ";" in line else line.split() for line in lines]

@@ -156,7 +156,7 @@ def _find_names(path: Path, lines: list[str]) -> tuple[int, list[str]]:
 
 
 def _split(line: str) -> list[str]:
-    text = line.strip().lstrip("#").strip()
+    text = line.replace('"', "").strip().lstrip("#").strip()  # of a table, whose fields may all be quoted
     for mark in ("\t", ";", ","):
         if mark in text:
             return [field.strip() for field in text.split(mark)]
@@ -174,6 +174,6 @@ def _meaning(field: str) -> str:
     """The column that a name means; empty for other names, and for long ones, for which the patterns take hours."""
     if len(field) > MOST_NAME:
         return ""
-    bare = re.sub(r"[\[(].*?[\])]", "", field.strip().strip('"').lower())
+    bare = re.sub(r"[\[(].*?[\])]", "", field.strip().lower())
     bare = re.sub(r"[^a-z]", "", re.sub(r"_(m|s|deg)$", "", bare))
     return next((name for name, known in COLUMN_NAMES.items() if bare in known), "")

@@ -107,6 +107,10 @@ LEVEL = 30
 """Steps of coordinates by which rays may miss their meeting place over ground that is level at 0: rounding and noise of
 returns make some, heights that were taken off make hundreds."""
 
+OF_WAY, STANDS = 0.5, 0.2
+"""Share of the way by the packet vectors below which a trajectory is of no such flight, since clocks that are off leave
+the way as it is; and speed below which a sensor stands, so that no clock shows [m/s]."""
+
 LEAST_AGREEING = 20
 """Fewest rays of other digitizers that must agree with a trajectory, each after a ray that does not, for vectors to be
 wrong and not the trajectory."""
@@ -496,12 +500,19 @@ def _from_file(
             range_error_m = float(abs(np.mean(longer)) + np.std(longer))
             if range_error_m > seen.error:  # a contradiction is known no better than the vectors are
                 range_error_m = float(np.hypot(range_error_m, seen.error))
+        ends = (np.diff(one.at(np.array([start, stop])), axis=0) for one in (known, by_vectors))
+        flown, seen_way = (float(np.sqrt(np.square(way).sum())) for way in ends)
+        if seen_way > max(MOUNTING * (seen.distance or 0.0), 10.0 * seen.error) and flown < OF_WAY * seen_way:
+            raise InputError(
+                f"{path}: the trajectory moves by {flown:.1f} m during the strip, but the packets' vectors come from a "
+                f"sensor that moves by {seen_way:.1f} m: its positions stand still, or its times run slower"
+            )
         # By how much the trajectory comes later than the path by the packet vectors, in s and in m along the flight.
         step = known.at(by_vectors.time + 0.5 * NODE_SECONDS) - known.at(by_vectors.time - 0.5 * NODE_SECONDS)
         square = np.einsum("ni,ni->n", step, step)
         with np.errstate(invalid="ignore", divide="ignore"):
             lag = NODE_SECONDS * np.einsum("ni,ni->n", by_vectors.xyz - known.at(by_vectors.time), step) / square
-        there = np.isfinite(lag)
+        there = np.isfinite(lag) & (square > (NODE_SECONDS * STANDS) ** 2)
         if there.any():
             middle = float(median(lag[there]))
             late = round(middle, 4)
