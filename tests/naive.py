@@ -132,9 +132,10 @@ def differentiate(function, parameters, step=1e-5):
 
 
 def fisher_errors(parameters, x, std, **shape):
-    """Standard deviations (3, k) from the inverse Fisher matrix, derivatives by differences."""
+    """Standard deviations (3, k) from the inverse Fisher matrix, derivatives by differences, and its covariance."""
     jacobian = differentiate(lambda flat: model(flat.reshape(parameters.shape), x, **shape), parameters)
-    return np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))).reshape(parameters.shape) * std
+    covariance = np.linalg.inv(jacobian.T @ jacobian) * std**2
+    return np.sqrt(np.diag(covariance)).reshape(parameters.shape), covariance
 
 
 def log_parabola(smooth, at, width):

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import lazrs
 import numpy as np
+import pytest
 
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.options import RunOptions
+from wavebatch.core.errors import InputError
 from wavebatch.files.las.header import STANDARD_DTYPES, Vlr, read_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.choose_chain import Request, widest_chain
@@ -243,6 +245,14 @@ def read_plainly(points: np.ndarray, data: bytes, kinds: dict[int, tuple[int, in
         samples = np.frombuffer(data[offset : offset + n * bits // 8], f"<u{bits // 8}")
         packets[kind, offset] = (samples, [index])
     return packets
+
+
+def refused(path: Path, pattern: str) -> None:
+    """The strip must be refused in one line that begins with its path and holds the pattern."""
+    with pytest.raises(InputError, match=pattern) as caught, StripReader(path) as reader:
+        reader.scan()
+    text = str(caught.value)
+    assert text.startswith(str(path)) and "\n" not in text, text
 
 
 def read_all(path: Path, *, size: int = 7, owned_only: bool = True, **options) -> dict:

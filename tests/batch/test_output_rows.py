@@ -46,6 +46,25 @@ def spoilt(tiny_strip, edit_points, tmp_path_factory):
     return edit_points(tiny_strip, tmp_path_factory.mktemp("spoilt") / "spoilt.las", _spoil)
 
 
+@pytest.fixture(scope="module")
+def looped(spoilt):
+    """What a loop finds of the strip: points, echoes and members by owner, flags, rows of echoes mode, header."""
+    points, echoes, members, flags, header = _read_packets(spoilt)
+    rows = _expect_rows(points, echoes, members, flags, header.scales, header.offsets)
+    return points, echoes, members, flags, rows, header
+
+
+def _read_unit(path, **options):
+    """The first unit of a strip, what was prepared for it, and each block with its packets and echoes."""
+    prepared = prepare_strip(make_job(path, **options))
+    with StripReader(path) as reader:
+        unit = reader.read_unit(0, prepared.scan)
+        blocks = reader.read_blocks(unit, 100, owned_only=options.get("points") != "returns")
+        found = [(block, index, prepared.job.chain.run(block, prepared.system)) for block, index in blocks]
+    prepared.scan.close()
+    return prepared, unit, found
+
+
 def _read_packets(path):
     """Per packet, by its first point: the echoes, and the points in it."""
     prepared = prepare_strip(make_job(path))
@@ -75,7 +94,7 @@ def _read_packets(path):
                         )
                     }
     prepared.scan.close()
-    return np.concatenate(points), echoes, members, flags, prepared
+    return np.concatenate(points), echoes, members, flags, prepared.facts.header
 
 
 def _find_pulse(points, leads, place):
@@ -162,17 +181,15 @@ def _expect_numbers(rows, echoes, members, points):
     return numbers
 
 
-def test_every_row_of_echoes_mode_is_what_a_loop_makes(spoilt, tmp_path):
+def test_every_row_of_echoes_mode_is_what_a_loop_makes(spoilt, looped, tmp_path):
     outcome = run_one(spoilt, tmp_path, format="las")
     assert outcome.error is None
-    points, echoes, members, flags, prepared = _read_packets(spoilt)
-    facts = prepared.facts
-    expected = _expect_rows(points, echoes, members, flags, facts.header.scales, facts.header.offsets)
+    points, echoes, members, flags, expected, header = looped
     found, xyz = read_cloud(tmp_path / "spoilt.las")
     assert len(found) == len(expected)
     assert found["point_source_id"].tolist() == [row["source"] for row in expected]
     assert found["echo_flags"].tolist() == [row["flags"] for row in expected]
-    assert np.abs(xyz - np.array([row["xyz"] for row in expected])).max() <= 0.5 * max(facts.header.scales) + 1e-9
+    assert np.abs(xyz - np.array([row["xyz"] for row in expected])).max() <= 0.5 * max(header.scales) + 1e-9
     amplitude = [-9999.0 if row["amplitude"] is None else row["amplitude"] for row in expected]
     assert found["amplitude"].tolist() == amplitude
     numbers = _expect_numbers(expected, echoes, members, points)
@@ -188,12 +205,10 @@ def test_every_row_of_echoes_mode_is_what_a_loop_makes(spoilt, tmp_path):
     assert any(len(group) > 1 for group in members.values())
 
 
-def test_returns_mode_keeps_every_point_and_adds_the_matching_echo(spoilt, tmp_path):
+def test_returns_mode_keeps_every_point_and_adds_the_matching_echo(spoilt, looped, tmp_path):
     outcome = run_one(spoilt, tmp_path, points="returns", format="las")
     assert outcome.error is None
-    points, echoes, members, flags, prepared = _read_packets(spoilt)
-    header = prepared.facts.header
-    rows = _expect_rows(points, echoes, members, flags, header.scales, header.offsets)
+    points, _, _, flags, rows, _ = looped
     found, _ = read_cloud(tmp_path / "spoilt.las")
     for name in ("X", "Y", "Z", "gps_time", "intensity", "point_source_id", "user_data"):
         assert (found[name] == points[name]).all(), name
@@ -218,13 +233,8 @@ def test_returns_mode_keeps_every_point_and_adds_the_matching_echo(spoilt, tmp_p
 def test_integer_columns_are_written_too(spoilt, monkeypatch, points, no_data, empty):
     """They came out as 0 in every row once, because only floats were taken along."""
     monkeypatch.setitem(COLUMNS, "amplitude", Column("amplitude", "u1", "-", "number of the echo", no_data))
-    prepared = prepare_strip(make_job(spoilt, points=points))
-    with StripReader(spoilt) as reader:
-        unit = reader.read_unit(0, prepared.scan)
-        blocks = reader.read_blocks(unit, 100, owned_only=points == "echoes")
-        echoes = gather_echoes(
-            unit, [(block, index, prepared.job.chain.run(block, prepared.system)) for block, index in blocks]
-        )
+    prepared, unit, found = _read_unit(spoilt, points=points)
+    echoes = gather_echoes(unit, found)
     number = (np.arange(len(echoes.table)) % 200 + 1).astype(np.uint8)
     echoes = dataclasses.replace(echoes, table=echoes.table.with_attributes(amplitude=number))
     rows = (assemble_echoes if points == "echoes" else assemble_returns)(unit, echoes, prepared.layout).rows
@@ -237,38 +247,25 @@ def test_integer_columns_are_written_too(spoilt, monkeypatch, points, no_data, e
     alone = unit.point_flags[rows["point_source_id"][is_echo]] > 0
     assert len(more) == (np.count_nonzero(alone) if points == "returns" else 0)
     assert np.count_nonzero(~is_echo) > 10 and (rows["amplitude"][~is_echo] == empty).all()
-    prepared.scan.close()
 
 
 def test_echoes_of_several_blocks_are_in_the_order_of_their_packets(spoilt):
     """Blocks of several digitizers, or of several lengths, have the packets of a unit in turn."""
-    prepared = prepare_strip(make_job(spoilt))
-    with StripReader(spoilt) as reader:
-        unit = reader.read_unit(0, prepared.scan)
-        blocks = list(reader.read_blocks(unit, 100, owned_only=True))
+    prepared, unit, found = _read_unit(spoilt)
     cuts = slice(0, None, 2), slice(1, None, 2)
-    halves = [(block.rows(cut), index[cut]) for block, index in blocks for cut in cuts]
-    chain, system = prepared.job.chain, prepared.system
-    whole, mixed = (
-        gather_echoes(unit, [(block, index, chain.run(block, system)) for block, index in parts])
-        for parts in (blocks, halves)
-    )
+    parts = [(block.rows(cut), index[cut]) for block, index, _ in found for cut in cuts]
+    halves = [(block, index, prepared.job.chain.run(block, prepared.system)) for block, index in parts]
+    whole, mixed = gather_echoes(unit, found), gather_echoes(unit, halves)
     assert len(whole.table) > 100 and (np.diff(whole.table.waveform) >= 0).all()
     for name in ("waveform", "time", "amplitude"):
         np.testing.assert_array_equal(getattr(mixed.table, name), getattr(whole.table, name))
     np.testing.assert_array_equal(mixed.nearest, whole.nearest)
-    prepared.scan.close()
 
 
 def test_points_without_a_location_come_first_of_their_packet(tiny_strip):
     """The reader calls them broken today; if one got a packet, NaN would put it behind the echoes, or anywhere."""
-    prepared = prepare_strip(make_job(tiny_strip))
-    with StripReader(tiny_strip) as reader:
-        unit = reader.read_unit(0, prepared.scan)
-        blocks = list(reader.read_blocks(unit, 100, owned_only=True))
-    prepared.scan.close()
-    chain, system = prepared.job.chain, prepared.system
-    echoes = gather_echoes(unit, [(block, index, chain.run(block, system)) for block, index in blocks])
+    prepared, unit, found = _read_unit(tiny_strip)
+    echoes = gather_echoes(unit, found)
     added = echoes.table.with_attributes(point=np.full(len(echoes.table), -1))  # so that all points have no echo
     points = np.array(unit.points)
     points["point_source_id"] = np.arange(len(points))
@@ -287,11 +284,9 @@ def test_points_without_a_location_come_first_of_their_packet(tiny_strip):
     assert of_several > 5
 
 
-def test_counts_are_those_of_a_loop(spoilt, tmp_path):
+def test_counts_are_those_of_a_loop(spoilt, looped, tmp_path):
     report = run_one(spoilt, tmp_path).report
-    points, echoes, members, flags, prepared = _read_packets(spoilt)
-    header = prepared.facts.header
-    rows = _expect_rows(points, echoes, members, flags, header.scales, header.offsets)
+    points, echoes, members, flags, rows, _ = looped
     without = sum(row["flags"] == EchoFlag.NO_WAVEFORM for row in rows)
     joined = sum(flag == EchoFlag.NO_WAVEFORM for flag in flags.values()) - without
     found = {owner: group for owner, group in echoes.items() if group}
@@ -474,13 +469,7 @@ def test_points_that_are_stored_twice_do_not_count_as_returns(edit_points, tmp_p
 
 
 def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):
-    prepared = prepare_strip(make_job(tiny_strip, points="returns"))
-    with StripReader(tiny_strip) as reader:
-        unit = reader.read_unit(0, prepared.scan)
-        results = [
-            (block, index, prepared.job.chain.run(block, prepared.system))
-            for block, index in reader.read_blocks(unit, 100, owned_only=True)
-        ]
+    prepared, unit, results = _read_unit(tiny_strip)
     refuses(StageError, "exactly once", gather_echoes, unit, results[1:])
     refuses(StageError, "exactly once", gather_echoes, unit, [*results, results[0]])
     echoes = gather_echoes(unit, results)
@@ -489,7 +478,6 @@ def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):
     doubled[matched[1]] = doubled[matched[0]]
     wrong = dataclasses.replace(echoes, table=echoes.table.with_attributes(point=doubled))
     refuses(StageError, "one to one", assemble_returns, unit, wrong, prepared.layout)
-    prepared.scan.close()
 
 
 def test_the_last_chunk_holds_the_rows_that_are_left_be_it_one():

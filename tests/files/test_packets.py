@@ -13,7 +13,7 @@ import pytest
 from commands import refuses, run_command, succeed
 from hypothesis import given
 from hypothesis import strategies as st
-from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_head, vlr
+from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_head, refused, vlr
 from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
@@ -21,14 +21,6 @@ from wavebatch.files.strip.packet_check import DirectionTally, decide_direction,
 from wavebatch.files.strip.packets import PacketFile, PacketPlace
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import ScanSizes
-
-
-def refused(path, pattern, **options):
-    with pytest.raises(InputError, match=pattern) as caught, StripReader(path, **options) as reader:
-        reader.scan()
-    text = str(caught.value)
-    assert text.startswith(str(path)) and "\n" not in text
-    return text
 
 
 def plain_of(raw, bits=8, samples=32):
@@ -86,7 +78,7 @@ def test_headerless_wdp_is_refused_unless_forced(tmp_path):
     raw = make_raw(internal=False)
     raw.head = b""
     path = raw.write(tmp_path / "a.las")
-    assert "--headerless" in refused(path, "does not begin with the 60-byte header")
+    refused(path, "does not begin with the 60-byte header.*--headerless")
     assert_read(path, raw, headerless=True)
     with StripReader(path, headerless=True) as reader:
         assert (reader.facts.packets.base, reader.facts.packets.start) == (-60, 0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commands import refuses
 from numpy.lib import recfunctions
-from strips import make_raw
+from strips import make_raw, refused
 from writer_tools import BACKENDS, data_file, read_raw, write_points
 
 from wavebatch.core.errors import ConfigError, InputError
@@ -98,13 +98,8 @@ def payload_at(path):
     return path.read_bytes().index(b"laszip encoded") - 2 + 54
 
 
-def refused(path, pattern):
-    with pytest.raises(InputError, match=pattern) as caught, StripReader(path) as reader:
-        reader.scan()
-    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(("at", "data", "pattern"), [
+    (-52, b"other", "missing or wrong"),
     (0, struct.pack("<H", 1), "without chunks"),
     (2, struct.pack("<H", 7), "missing or wrong"),
     (12, struct.pack("<I", 0), "without chunks"),
@@ -119,11 +114,6 @@ def refused(path, pattern):
 def test_lies_of_the_laszip_record(tmp_path, at, data, pattern):
     _, path = laz_of(tmp_path)
     refused(patch(path, payload_at(path) + at, data), pattern)
-
-
-def test_a_missing_laszip_record(tmp_path):
-    _, path = laz_of(tmp_path)
-    refused(patch(path, payload_at(path) - 52, b"other"), "missing or wrong")
 
 
 @pytest.mark.parametrize("place", [0, 1, -2, 2**62, -(2**63)])
@@ -155,12 +145,6 @@ def test_layers_that_claim_more_than_their_chunk_holds(tmp_path):
     _, path = laz_of(tmp_path, 9)
     begin = struct.unpack_from("<I", path.read_bytes(), 96)[0]
     refused(patch(path, begin + 8 + 59 + 4, struct.pack("<I", 2**32 - 1)), "a LAZ chunk of .* claims")
-
-
-def test_more_points_than_any_compression_holds(tmp_path):
-    raw = make_raw(point_format=9)
-    raw.count = 2**60
-    refused(raw.write(tmp_path / "a.laz"), "the header claims 1152921504606846976 points in")
 
 
 @pytest.mark.parametrize("cut", [0.3, 0.6, 0.9, 0.999])
@@ -356,10 +340,18 @@ def test_lies_of_the_header(tmp_path, at, form, value, pattern):
     refused(patch(make_raw().write(tmp_path / "a.las"), at, struct.pack(form, value)), pattern)
 
 
-def test_points_that_would_run_into_the_packets(tmp_path):
-    raw = make_raw()
-    raw.count = len(raw.points) + 1
-    refused(raw.write(tmp_path / "a.las"), "waveform record begins at byte")
+@pytest.mark.parametrize(("made", "name", "changes", "pattern"), [
+    ({"point_format": 9}, "a.laz", {"count": 2**60}, "the header claims 1152921504606846976 points in"),
+    ({}, "a.las", {"count": 1 + len(make_raw().points)}, "waveform record begins at byte"),
+    ({"point_format": 9, "internal": False}, "a.las", {"behind": bytes(100), "evlr": (1000, 1)},
+     "EVLRs begin at byte 1000"),
+])  # fmt: skip
+def test_points_that_cannot_be_there_are_refused(tmp_path, made, name, changes, pattern):
+    """More than any compression holds, or where packets or extended records are."""
+    raw = make_raw(**made)
+    for field, value in changes.items():
+        setattr(raw, field, value)
+    refused(raw.write(tmp_path / name), pattern)
 
 
 @pytest.mark.parametrize(("internal", "before"), [(True, "its waveform record begins"), (False, "it ends")])
@@ -370,13 +362,6 @@ def test_points_beyond_the_number_in_the_header_are_named(tmp_path, internal, be
     with StripReader(raw.write(tmp_path / "a.las")) as reader:
         (line,) = reader.facts.warnings
     assert f"claims {raw.count} points, which leaves room for 3 more before {before}; what is there is not read" in line
-
-
-def test_points_that_would_run_into_the_evlrs(tmp_path):
-    raw = make_raw(point_format=9, internal=False)
-    raw.behind = bytes(100)
-    raw.evlr = (1000, 1)
-    refused(raw.write(tmp_path / "a.las"), "EVLRs begin at byte 1000")
 
 
 @pytest.mark.parametrize("count", [0, 1, 2**64 - 1])

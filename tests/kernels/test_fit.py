@@ -83,13 +83,6 @@ def test_default_tolerance_ends_within_a_fraction_of_the_error(rng):
     assert np.abs((loose.parameters - tight.parameters)[:, :3] / tight.errors[:, :3]).max() < 0.1
 
 
-def test_exact_waveforms_give_exact_parameters(rng):
-    truth = draw(rng, 40, 2)
-    found = fit(record(rng, truth, noise=0.0), near(rng, truth), **TIGHT)
-    np.testing.assert_allclose(found.parameters[:, :3], truth, rtol=1e-5)
-    np.testing.assert_allclose(found.cost, 0, atol=1e-4)
-
-
 def test_times_are_as_exact_at_the_end_of_a_long_window(rng):
     truth = draw(rng, 6, 1)
     truth[:, 1] += 60_000
@@ -199,20 +192,13 @@ def test_counts_of_any_size_are_read_as_they_are(rng, kind):
 @pytest.mark.parametrize(("k", "apart"), [(1, 6.0), (2, 6.0), (2, 3.0), (3, 4.0)])
 def test_errors_are_those_of_the_inverse_fisher_matrix(rng, shape, k, apart):
     truth = draw(rng, 10, k, apart)
-    found = fit(record(rng, truth, shape), truth, shape=shape, **TIGHT)
+    found = fit(record(rng, truth, shape, noise=0.7), truth, shape=shape, std=0.7, **TIGHT)
     x = np.arange(float(LENGTH))
     for i in np.flatnonzero(~found.at_bound.any(axis=1)):
         p = found.parameters[i, :3]
-        plain = naive.fisher_errors(p, x, 1.0, kappa=shape.kappa, components=shape.components)
+        plain, _ = naive.fisher_errors(p, x, 0.7, kappa=shape.kappa, components=shape.components)
         # Errors are those of the last step but one: where echoes overlap, they change with every step.
         np.testing.assert_allclose(found.errors[i, :3], plain, rtol=2e-3 if apart > 5 else 0.15)
-
-
-def test_errors_grow_with_the_noise(rng):
-    truth = draw(rng, 5, 1)
-    y = record(rng, truth)
-    one, three = (fit(y, truth, std=std, **TIGHT) for std in (1.0, 3.0))
-    np.testing.assert_allclose(three.errors[:, :3], 3 * one.errors[:, :3], rtol=1e-3)
 
 
 def test_two_echoes_in_one_place_do_not_break_the_fit(rng):
@@ -306,53 +292,19 @@ def test_undamped_steps_lead_to_the_least_squares(rng):
     np.testing.assert_allclose(found.parameters[:, :3], plain, atol=2e-3)
 
 
-def numeric_bounds(parameters, noise_std, spacing, n_samples):
-    """Naive twin: derivatives by central differences, Fisher matrix and its inverse, one waveform."""
-    x = np.arange(n_samples) * spacing
-
-    def model(p):
-        return sum(a * np.exp(-0.5 * ((x - t) / s) ** 2) for t, a, s in p.reshape(-1, 3))
-
-    start = np.array(parameters, float).ravel()
-    columns = []
-    for i in range(len(start)):
-        step = np.zeros(len(start))
-        step[i] = 1e-6 * max(abs(start[i]), 1.0)
-        columns.append((model(start + step) - model(start - step)) / (2 * step[i]))
-    jacobian = np.array(columns).T
-    covariance = np.linalg.inv(jacobian.T @ jacobian) * noise_std**2
-    return np.sqrt(np.diag(covariance)).reshape(-1, 3), covariance
-
-
 @pytest.mark.parametrize(
     ("sigma", "spacing", "tolerance"),
     [(1.5, 1.0, 1e-3), (2.0, 1.0, 1e-3), (4.0, 2.0, 1e-3), (1.0, 1.0, 1e-2), (0.5, 0.25, 1e-3)],
 )
 @pytest.mark.parametrize("phase", [0.0, 0.21, 0.5])
 def test_closed_forms_equal_the_fisher_matrix(sigma, spacing, tolerance, phase):
-    time = (30 + phase) * spacing
-    (expected,), covariance = numeric_bounds([(time, 50.0, sigma)], 1.3, spacing, 64)
-    found = crlb(np.array(50.0), np.array(sigma), 1.3, spacing)
-    assert np.allclose(np.array(found), expected, rtol=tolerance)
+    truth = np.array([[50.0], [(30 + phase) * spacing], [sigma]])
+    (amplitude, time, width), covariance = naive.fisher_errors(truth, spacing * np.arange(64), 1.3)
+    found = np.array(crlb(np.full(2, 50.0), np.full(2, sigma), np.array([1.3, 2.6]), spacing))
+    assert np.allclose(found, np.array([time, amplitude, width]) * [1.0, 2.0], rtol=tolerance)
     if tolerance < 1e-2:
-        correlation = covariance[1, 2] / np.sqrt(covariance[1, 1] * covariance[2, 2])
+        correlation = covariance[0, 2] / np.sqrt(covariance[0, 0] * covariance[2, 2])
         assert correlation == pytest.approx(-1 / np.sqrt(3), abs=2e-3)
-
-
-def test_constants_of_the_specification():
-    time, amplitude, sigma = crlb(np.array([20.0]), np.array([1.7]), 1.0, 1.0)
-    assert time == pytest.approx(1.0623 / 20 * np.sqrt(1.7), rel=1e-4)
-    assert sigma == pytest.approx(time)
-    assert amplitude == pytest.approx(0.9199 / np.sqrt(1.7), rel=1e-4)
-    assert time * 14.9896 == pytest.approx(1.04, abs=0.005)
-
-
-def test_bounds_broadcast_noise_per_echo():
-    noise = np.array([1.0, 2.0])
-    time, amplitude, sigma = crlb(np.array([50.0, 50.0]), np.array([2.0, 2.0]), noise, 1.0)
-    assert time[1] == pytest.approx(2 * time[0])
-    assert amplitude[1] == pytest.approx(2 * amplitude[0])
-    assert sigma.shape == (2,)
 
 
 def inflate(time, amplitude):

@@ -347,7 +347,7 @@ def test_bounds_are_the_closed_forms():
     alone = crlb(np.array([50.0]), np.array([2.0]), recording.recorded_noise, 1.0)
     assert found[0] == pytest.approx(np.array(alone)[:, 0], rel=2e-3)
     pair = np.array([[80.0, 40.0], [30.0, 37.0], [2.6, 2.0]])
-    expected = naive.fisher_errors(pair, np.arange(80.0), recording.recorded_noise)
+    expected, _ = naive.fisher_errors(pair, np.arange(80.0), recording.recorded_noise)
     assert found[1:] == pytest.approx(expected[[1, 0, 2]].T, rel=2e-3)
     assert accuracy.find_bounds(recording, EchoTable.empty(), 3).shape == (0, 3)
 
