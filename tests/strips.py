@@ -247,6 +247,14 @@ def read_plainly(points: np.ndarray, data: bytes, kinds: dict[int, tuple[int, in
     return packets
 
 
+def assert_same(found: dict, plain: dict) -> None:
+    """Packets of `read_all` have the samples and points of those of `read_plainly`."""
+    assert found.keys() == plain.keys()
+    for key, (samples, members) in plain.items():
+        np.testing.assert_array_equal(found[key][0], samples)
+        assert found[key][1] == members
+
+
 def refused(path: Path, pattern: str) -> None:
     """The strip must be refused in one line that begins with its path and holds the pattern."""
     with pytest.raises(InputError, match=pattern) as caught, StripReader(path) as reader:

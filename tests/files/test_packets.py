@@ -13,7 +13,7 @@ import pytest
 from commands import refuses, run_command, succeed
 from hypothesis import given
 from hypothesis import strategies as st
-from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_head, refused, vlr
+from strips import TOWARD, assert_same, descriptor, make_raw, read_all, read_plainly, record_head, refused, vlr
 from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
@@ -28,12 +28,7 @@ def plain_of(raw, bits=8, samples=32):
 
 
 def assert_read(path, raw, **options):
-    found = read_all(path, **options)
-    plain = plain_of(raw)
-    assert found.keys() == plain.keys()
-    for key, (samples, members) in plain.items():
-        np.testing.assert_array_equal(found[key][0], samples)
-        assert found[key][1] == members
+    assert_same(read_all(path, **options), plain_of(raw))
 
 
 def test_upper_case_wdp_is_found(tmp_path):

@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 from commands import refuses
-from strips import descriptor, make_raw, read_all, read_plainly
+from strips import assert_same, descriptor, make_raw, read_all, read_plainly
 from writer_tools import data_file, read_raw
 
 from wavebatch.core.echoes import EchoFlag
@@ -23,13 +23,6 @@ from wavebatch.tools.simulate import simulate_strip
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"
-
-
-def assert_same(found, plain):
-    assert found.keys() == plain.keys()
-    for key, (samples, members) in plain.items():
-        np.testing.assert_array_equal(found[key][0], samples)
-        assert found[key][1] == members
 
 
 @pytest.mark.parametrize(("declared", "bits"), [(5, 8), (10, 16), (12, 16), (24, 32)])

@@ -110,19 +110,11 @@ def empty_entry(block: WaveformBlock, noise: Noise, system: SystemPulse, *, leve
     """
 
 
-def wrong_data(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """Echoes."""
-
-
 def wrong_order(noise: Noise, block: WaveformBlock, system: SystemPulse) -> EchoTable:
     """Echoes."""
 
 
 def wrong_return(block: WaveformBlock, noise: Noise, system: SystemPulse) -> Noise:
-    """Echoes."""
-
-
-def no_return(block: WaveformBlock, noise: Noise, system: SystemPulse):
     """Echoes."""
 
 
@@ -133,10 +125,8 @@ def no_return(block: WaveformBlock, noise: Noise, system: SystemPulse):
         (no_meaning, "an entry under Parameters"),
         (other_parameter, "parameter level needs a default and an entry"),
         (empty_entry, "parameter level needs a default and an entry"),
-        (wrong_data, "a detect stage takes"),
         (wrong_order, "a detect stage takes"),
         (wrong_return, "annotated to return EchoTable"),
-        (no_return, "annotated to return EchoTable"),
     ],
 )
 def test_the_decorator_refuses_functions_that_are_no_stage(function, words):

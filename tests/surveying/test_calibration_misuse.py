@@ -955,13 +955,15 @@ def test_a_column_that_is_no_reflectance_of_the_channel_is_named(tmp_path):
     assert load_calibration(tmp_path / "cal.toml").relative_error > 0.5
 
 
-def test_a_column_of_backscatter_coefficients_is_no_reflectance(tmp_path):
-    """Of a cloud of an earlier run: the constant was 4 times too large, with an error of 3 %."""
-    sensor = replace(SENSOR, vendor="share")
-    write_strip(tmp_path / "s.las", FARMLAND, sensor, 3000, seed=90, store=lambda stored: np.multiply(
-        stored.facing, 4.0, out=stored.facing))  # fmt: skip
-    fail(1, "exceed 1.5, as no surfaces have", "calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o",
-         tmp_path / "cal.toml")  # fmt: skip
+@pytest.mark.parametrize(
+    ("vendor", "factor", "said"), [("share", 4.0, "exceed 1.5, as no surfaces"), ("dB", 0.02, "its median is 0.00")]
+)
+def test_backscatter_coefficients_and_amplitudes_are_no_reflectances(tmp_path, vendor, factor, said):
+    """Coefficients of an earlier run made the constant 4 times too large, with an error of 3 %; amplitudes in dB below
+    full scale made it 45 times too small, with 11 %."""
+    write_strip(tmp_path / "s.las", FARMLAND, replace(SENSOR, vendor=vendor), 3000, seed=90,
+                store=lambda stored: np.multiply(stored.facing, factor, out=stored.facing))  # fmt: skip
+    fail(1, said, "calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
 
 
 @pytest.mark.quick_cases("0.5")
@@ -976,15 +978,6 @@ def test_the_error_of_another_factor_of_decibels_reaches_to_white(tmp_path, powe
     off = 4 / (LIGHT * 2.0) / found.constant - 1  # amplitude times width of a white surface
     assert ("dark and bright echoes scatter" in done.stderr) == (power != 1.0)
     assert abs(off) < 1.1 * found.relative_error and (power != 1.0 or found.relative_error < 0.1)
-
-
-def test_amplitudes_over_full_scale_are_no_reflectances(tmp_path):
-    """In dB below 0 as reflectances are: constants were 45 times too small, with 11 % of error."""
-    sensor = replace(SENSOR, vendor="dB")
-    write_strip(tmp_path / "s.las", FARMLAND, sensor, 3000, seed=92, store=lambda stored: np.multiply(
-        stored.facing, 0.02, out=stored.facing))  # fmt: skip
-    fail(1, "its median is 0.00", "calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o",
-         tmp_path / "cal.toml")  # fmt: skip
 
 
 def test_a_copy_of_a_strip_is_refused(tmp_path, calibrated):

@@ -22,26 +22,26 @@ from wavebatch.kernels.library import Samples, call, place
 from wavebatch.kernels.signal.signal import accumulate
 
 
-def gaussian_taps(width: float, reach: float = 3.0) -> np.ndarray:
-    """Half of a Gaussian filter of height 1: taps 0, 1, ... up to `reach` widths [samples], float64."""
-    return exp(-0.5 * (np.arange(int(np.ceil(reach * width)) + 1) / width) ** 2)
+def gaussian_taps(width: float) -> np.ndarray:
+    """Half of a Gaussian filter of height 1: taps 0, 1, ... up to three widths [samples], float64."""
+    return exp(-0.5 * (np.arange(int(np.ceil(3.0 * width)) + 1) / width) ** 2)
 
 
-def curvature_taps(width: float, reach: float = 4.0) -> np.ndarray:
+def curvature_taps(width: float) -> np.ndarray:
     """Half of the negative second derivative of a Gaussian, made to sum to zero: taps 0, 1, ... [samples], float64."""
-    x = np.arange(int(np.ceil(reach * width)) + 1) / width
+    x = np.arange(int(np.ceil(4.0 * width)) + 1) / width
     taps = (1 - x * x) * exp(-0.5 * x * x)
     total = taps[0] + 2 * taps[1:].sum()
     bell = exp(-0.5 * x * x)
     return taps - bell * total / (bell[0] + 2 * bell[1:].sum())
 
 
-def slope_taps(width: float, reach: float = 4.0) -> np.ndarray:
+def slope_taps(width: float) -> np.ndarray:
     """Half of an antisymmetric filter, the derivative of a Gaussian: taps 0, 1, ... [samples], float64.
 
     The first one is 0. It gives the slope per sample of a straight line.
     """
-    x = np.arange(int(np.ceil(reach * width)) + 1)
+    x = np.arange(int(np.ceil(4.0 * width)) + 1)
     taps = x * exp(-0.5 * (x / width) ** 2)
     return taps / (2 * np.sum(taps * x))
 
