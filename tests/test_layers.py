@@ -128,7 +128,7 @@ def test_kernels_know_arrays_only():
     assert len(kernels) > 20
     for path in kernels:
         ours = {name for name in _imports(path) if name.startswith("wavebatch.core.")}
-        known = ("wavebatch.core.units", "wavebatch.core.order")
+        known = ("wavebatch.core.units", "wavebatch.core.order", "wavebatch.core.frozen")
         known += ("wavebatch.core.errors",) * (path.name == "library.py")
         assert all(name.startswith(known) for name in ours), (path, ours)
         assert _outside(path) <= allowed, path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import copy
 import importlib.util
 import inspect
@@ -18,7 +19,7 @@ import pytest
 from commands import refuses
 
 from wavebatch.core.errors import PACKAGES, advise_install
-from wavebatch.core.frozen import changeable, frozen
+from wavebatch.core.frozen import NamedTuple, changeable, frozen
 
 
 @frozen
@@ -207,3 +208,47 @@ def test_no_advice_asks_the_package_index_for_wavebatch():
         if page.is_file():
             found = re.findall(r"pip install[^\n]*wavebatch\[[^\n]*", page.read_text("utf-8", "replace"))
             assert not found, (page, found)
+
+
+class Named(NamedTuple):
+    """A tuple of fields."""
+
+    x: int
+    y: float = 2.0
+
+    @property
+    def sum(self) -> float:
+        """Of both fields."""
+        return self.x + self.y
+
+
+class Other(Named):
+    """Has the fields of another."""
+
+
+@pytest.mark.parametrize("kind", [Named, Other])
+def test_a_named_tuple_is_like_that_of_python(kind: type[Named]) -> None:
+    twin = collections.namedtuple(kind.__name__, ("x", "y"), defaults=(2.0,))  # noqa: PYI024
+    for values, named in ((1, 3.0), {}), ((1,), {}), ((1,), {"y": 4.0}), ((), {"y": 4.0, "x": 1}):
+        one, other = kind(*values, **named), twin(*values, **named)
+        assert one == other and repr(one) == repr(other) and one._asdict() == other._asdict()
+        assert (one.x, one.y, one.sum) == (*other, sum(other)) and hash(one) == hash(other)
+        assert one._replace(x=7) == other._replace(x=7) and kind._make(other) == other
+        for copied in (pickle.loads(pickle.dumps(one)), copy.deepcopy(one)):
+            assert copied == one and type(copied) is kind
+    for name in ("_fields", "_field_defaults", "__match_args__"):
+        assert getattr(kind, name) == getattr(twin, name)
+    with pytest.raises(AttributeError):
+        kind(1).x = 2
+    with pytest.raises(AttributeError):
+        kind(1).z = 2
+    for values, named in ((), {}), ((1, 2, 3), {}), ((1,), {"x": 2}), ((1,), {"z": 2}), ((), {"y": 1, "z": 2}):
+        with pytest.raises(TypeError, match=f"{kind.__name__} takes x, y, each once"):
+            kind(*values, **named)
+        with pytest.raises(TypeError):
+            twin(*values, **named)
+
+
+def test_classes_of_fields_keep_their_annotations() -> None:
+    assert Checked.__annotations__ == {"last": "int"}
+    assert {one.name: one.type for one in fields(Checked)} == inspect.get_annotations(Twin) | {"last": "int"}

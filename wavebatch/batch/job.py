@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from wavebatch.batch.options import RunOptions
 from wavebatch.batch.output_rows import NEEDED
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, nearest
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.column_names import name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter

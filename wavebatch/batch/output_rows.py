@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wavebatch.batch.counts import RunReport, count_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable, count_reasons
 from wavebatch.core.errors import StageError
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock

@@ -59,6 +59,10 @@ def report_path(job: StripJob, folder: Path) -> Path:
     return folder / f"{job.path.stem}.report.json"
 
 
+_hashed: list[tuple[SavedSurvey, str]] = []
+"""A survey and its checksum, once for the strips that share it: that of a flight names all of them."""
+
+
 def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
     """Describe all that decides the output: two runs with equal descriptions write the same cloud.
 
@@ -76,6 +80,8 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
     energy = job.energy if job.energy_file is None else take_fingerprint(job.energy_file)
+    if saved is not None and not (_hashed and _hashed[0][0] is saved):
+        _hashed[:] = [(saved, hashlib.sha256(format_survey(saved).encode()).hexdigest())]
     # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
     flight = {"survey": "flight"} if job.request.flight else {}
     return {
@@ -85,7 +91,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
         | {"columns": list(job.columns)},
         "request": {
             "chain": job.request.describe() or effective(job.chain),
-            "system": None if saved is None else _hash_survey(saved),
+            "system": None if saved is None else _hashed[0][1],
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
             "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
@@ -94,16 +100,6 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             **({"selection": job.selection.describe()} if job.selection else {}),
         },
     }
-
-
-_hashed: list[tuple[SavedSurvey, str]] = []
-
-
-def _hash_survey(saved: SavedSurvey) -> str:
-    """The checksum of a survey, once for the strips that share it: that of a flight names all of them."""
-    if not (_hashed and _hashed[0][0] is saved):
-        _hashed[:] = [(saved, hashlib.sha256(format_survey(saved).encode()).hexdigest())]
-    return _hashed[0][1]
 
 
 def describe_strip_result(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:

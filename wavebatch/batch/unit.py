@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from wavebatch.batch.output_rows import (
 )
 from wavebatch.core.echoes import NoData
 from wavebatch.core.errors import InputError, StripWarning
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse

@@ -9,14 +9,15 @@ from __future__ import annotations
 import functools
 import numbers
 import os
+import sys
 import types
 import typing
 from dataclasses import field, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 
 
 class Range(NamedTuple):
@@ -108,6 +109,17 @@ _LATE = {name: type(name, (), {}) for name in ("Chain", "Condition", "Survey")}
 """Stand for types that only Python gives, which are known by their names: they take time to import."""
 
 
+def evaluate_hints(kind: type) -> dict[str, Any]:
+    """Annotations of a dataclass, as `typing.get_type_hints` gives them, which compiles each of them apart."""
+    found: dict[str, Any] = {}
+    for base in reversed(kind.__mro__):
+        hints, known = vars(base).get("__annotations__", {}), vars(sys.modules[base.__module__])
+        texts = [hint if isinstance(hint, str) else f"hints[{name!r}]" for name, hint in hints.items()]
+        values = eval(f"({''.join(f'{text}, ' for text in texts)})", known, {**_LATE, "hints": hints})
+        found |= dict(zip(hints, values, strict=True))
+    return found
+
+
 @frozen
 class Option:
     """What the documentation says about an option."""
@@ -147,7 +159,7 @@ class Declared(NamedTuple):
 @functools.cache
 def declared_options(kind: type) -> dict[str, Declared]:
     """The options of a dataclass by the names of their fields."""
-    hints = typing.get_type_hints(kind, localns=_LATE, include_extras=True)
+    hints = evaluate_hints(kind)
     declared = {one.name: one for one in fields(kind) if "option" in one.metadata}
     return {
         name: Declared(one.default, one.metadata["option"], *read_hint(hints[name])) for name, one in declared.items()

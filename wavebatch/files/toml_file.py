@@ -21,11 +21,11 @@ import tomllib
 import types
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin
 
 from wavebatch.core.errors import ConfigError, nearest
-from wavebatch.core.frozen import frozen
-from wavebatch.core.schema import Key, Range
+from wavebatch.core.frozen import NamedTuple, frozen
+from wavebatch.core.schema import Key, Range, evaluate_hints
 
 LARGEST_INTEGER = 1 << 53
 """Largest integer that is taken for a number: a float64 holds all integers up to here exactly."""
@@ -299,7 +299,7 @@ class Entry(NamedTuple):
 @functools.cache
 def list_entries(kind: Any) -> tuple[Entry, ...]:
     """List the fields of a dataclass that have a Key."""
-    hints, found = get_type_hints(kind, include_extras=True), []
+    hints, found = evaluate_hints(kind), []
     for one in dataclasses.fields(kind):
         hint, notes = _split(hints[one.name])
         if not (keys := [note for note in notes if isinstance(note, Key)]):

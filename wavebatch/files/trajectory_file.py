@@ -146,7 +146,12 @@ def check_trajectory(path: Path) -> tuple[int, bool]:
 def _find_names(path: Path, lines: list[str]) -> tuple[int, list[str]]:
     """The line that names the columns, and what they mean; InputError where there is none."""
     for place, line in enumerate(lines[:200]):
-        found = [_meaning(field) for field in _split(line)]
+        found = []
+        for field in _split(line):
+            # The column that a name means; empty for other names, and for long ones, for which the patterns take hours.
+            bare = re.sub(r"[\[(].*?[\])]", "", field.strip().lower()) if len(field) <= MOST_NAME else ""
+            bare = re.sub(r"[^a-z]", "", re.sub(r"_(m|s|deg)$", "", bare))
+            found.append(next((name for name, known in COLUMN_NAMES.items() if bare in known), ""))
         if "time" in found and ({"x", "y", "z"} <= set(found) or {"latitude", "longitude", "z"} <= set(found)):
             return place, found
     raise InputError(
@@ -168,12 +173,3 @@ def _numbers(fields: list[str], number: int) -> list[float] | None:
         return [float(field) if field else np.nan for field in fields[:number]] if len(fields) >= number else None
     except ValueError:
         return None
-
-
-def _meaning(field: str) -> str:
-    """The column that a name means; empty for other names, and for long ones, for which the patterns take hours."""
-    if len(field) > MOST_NAME:
-        return ""
-    bare = re.sub(r"[\[(].*?[\])]", "", field.strip().lower())
-    bare = re.sub(r"[^a-z]", "", re.sub(r"_(m|s|deg)$", "", bare))
-    return next((name for name, known in COLUMN_NAMES.items() if bare in known), "")

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.kernels.build_kernels import LIBRARY, SOURCES, compile_library, is_outdated, is_whole
 
 _POINTER = ctypes.c_void_p

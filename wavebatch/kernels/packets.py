@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 import ctypes
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.kernels.library import CJudged, CPoints, CRules, address, call, place
 
 FIELDS = {"index": "u1", "offset": "<u8", "size": "<u4", "location": "<f4", "x": "<f4", "y": "<f4", "z": "<f4"}

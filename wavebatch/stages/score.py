@@ -5,12 +5,10 @@ Called by `bench`, `compare --truth` and predictions of errors.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.order import join_ranges, robust_std
 
 TOLERANCE_NS = 1.5

@@ -177,7 +177,13 @@ def hiding_failures() -> Iterator[None]:
     finally:
         if held:
             with interrupts.uninterrupted():
-                _release_stderr(*held, drop=fails)
+                kept, memory = held
+                os.dup2(kept, 2)
+                os.close(kept)
+                if not fails and (size := os.lseek(memory, 0, os.SEEK_END)):
+                    with contextlib.suppress(OSError):  # as for all messages: a full disk does not stop the work
+                        os.write(2, os.pread(memory, size, 0))
+                os.close(memory)
 
 
 def _hold_stderr(held: list[int]) -> None:
@@ -189,15 +195,6 @@ def _hold_stderr(held: list[int]) -> None:
         os.close(memory)
         raise
     os.dup2(memory, 2)
-
-
-def _release_stderr(kept: int, memory: int, *, drop: bool) -> None:
-    os.dup2(kept, 2)
-    os.close(kept)
-    if not drop and (size := os.lseek(memory, 0, os.SEEK_END)):
-        with contextlib.suppress(OSError):  # as for all messages: a full disk does not stop the work
-            os.write(2, os.pread(memory, size, 0))
-    os.close(memory)
 
 
 _ENDS = 1 << 20

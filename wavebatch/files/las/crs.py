@@ -26,10 +26,9 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 from wavebatch.core.errors import InputError, advise_install
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.files.las import header as las
 
 DOUBLES_ID = 34736

@@ -14,13 +14,13 @@ import itertools
 import struct
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import lazrs
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_failures, read_exactly, reading, undoing
 from wavebatch.files.las import header as las
 

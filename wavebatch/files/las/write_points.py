@@ -16,13 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import lazrs
 import numpy as np
 
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import naming, undoing
 from wavebatch.files.las import header as las

@@ -11,10 +11,10 @@ At the end fits become echoes of the whole pulse, with errors (kernels/c/echoes.
 from __future__ import annotations
 
 import ctypes
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.kernels import library
 from wavebatch.kernels.fit.neighbours import COLUMNS
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, TAIL_STEP, PulseShape, PulseTail

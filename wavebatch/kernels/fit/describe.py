@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.kernels import library
 from wavebatch.kernels.fit.decompose import as_pulse
 from wavebatch.kernels.fit.pulse_shape import PulseShape

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import group_medians, median
 from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.kernels.elementary import exp, solve

@@ -7,10 +7,11 @@ pairs. Laws say which echoes are faint, or what fits leave unexplained; stages m
 from __future__ import annotations
 
 import ctypes
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.kernels import library
 from wavebatch.kernels.library import Samples, call, place
 

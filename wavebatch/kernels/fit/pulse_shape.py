@@ -11,10 +11,10 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import distinct
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.kernels import library

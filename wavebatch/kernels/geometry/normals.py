@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import ctypes
 from enum import IntEnum
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.kernels import library
 from wavebatch.kernels.geometry.planes import (
     FLAT,

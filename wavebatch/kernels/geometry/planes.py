@@ -21,10 +21,10 @@ direction in which the rays do not differ has an unknown slope, and says so.
 from __future__ import annotations
 
 import ctypes
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.kernels.library import call
 

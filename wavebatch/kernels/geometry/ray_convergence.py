@@ -7,10 +7,9 @@ linear solution is pulled towards the ground; the angular one is not, so the lin
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import median, quantile
 from wavebatch.core.units import MAD_TO_STD
 

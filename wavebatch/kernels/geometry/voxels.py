@@ -6,9 +6,9 @@ coordinates. Rays do not influence each other, bit for bit.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
+
+from wavebatch.core.frozen import NamedTuple
 
 KEY_BITS = (23, 23, 18)
 """Bits of a key per axis: indices from -2^22 to 2^22 - 1 across, from -2^17 to 2^17 - 1 up and down."""

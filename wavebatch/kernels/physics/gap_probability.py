@@ -6,10 +6,9 @@ the ground counts as much as that from leaves.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.kernels.elementary import log
 

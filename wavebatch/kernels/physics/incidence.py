@@ -11,10 +11,10 @@ seen, these are too large.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.kernels.signal.runs import lobe_edges
 

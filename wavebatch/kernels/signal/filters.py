@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import ctypes
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.kernels import library
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.library import Samples, call, place

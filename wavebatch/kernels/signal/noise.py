@@ -12,10 +12,10 @@ from __future__ import annotations
 import ctypes
 from functools import lru_cache
 from math import pi, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import known_median, median, quantile
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, log, solve

@@ -6,10 +6,9 @@ level is drawn to that of all as far as levels do not differ by more than their 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import median
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, log
@@ -100,21 +99,17 @@ def find_reference(samples: np.ndarray) -> OutgoingReference | None:
     level = float(median(means))
     # Against the level of all: against its own, the correlation of a few samples is always negative.
     away = np.where(quiet[used], values[used] - level, 0)
-    gain = 1 + 2 * sum(_correlation(away, quiet[used], lag) for lag in range(1, MOST_LAGS + 1))
+    gain, power = 1.0, max((away**2).sum(), 1e-12)
+    for lag in range(1, MOST_LAGS + 1):
+        both = quiet[used, lag:] & quiet[used, :-lag]
+        if np.count_nonzero(both) >= 100:
+            product = np.where(both, away[:, lag:] * away[:, :-lag], 0).sum() / both.sum()
+            gain += 2 * max(float(product * quiet[used].sum() / power), 0.0)
     gain = float(np.clip(gain, 1.0, 1 + 2 * MOST_LAGS))
     within = noise**2 * gain / float(median(number[used]))
     total = float(MAD_TO_STD * median(np.abs(means - level))) ** 2
     spread = float(np.sqrt(max(total - within, 0.0)))
     return OutgoingReference(width, noise, gain, level, spread) if median(height) > LEAST_HEIGHT * noise else None
-
-
-def _correlation(away: np.ndarray, quiet: np.ndarray, lag: int) -> float:
-    """Correlation of quiet samples this far apart; 0 where they are too few."""
-    both = quiet[:, lag:] & quiet[:, :-lag]
-    if np.count_nonzero(both) < 100:
-        return 0.0
-    product = np.where(both, away[:, lag:] * away[:, :-lag], 0).sum() / both.sum()
-    return max(float(product * quiet.sum() / max((away**2).sum(), 1e-12)), 0.0)
 
 
 def measure_outgoing(samples: np.ndarray, reference: OutgoingReference) -> OutgoingPulses:

@@ -18,11 +18,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from wavebatch.core.echoes import SUFFIX, EchoFlag, EchoTable, NoData, explain_no_data
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
 from wavebatch.kernels.elementary import exp, log

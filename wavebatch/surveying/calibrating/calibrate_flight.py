@@ -14,12 +14,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.units import name_first
 from wavebatch.core.waveforms import angle_across, angle_to_vertical, swath_columns

@@ -16,11 +16,11 @@ import datetime
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import group_medians, robust_std
 from wavebatch.core.units import ASSUMED_DIVERGENCE, FWHM_PER_SIGMA, INSET, MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock

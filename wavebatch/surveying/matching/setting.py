@@ -7,12 +7,12 @@ header makes another sensor of it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import even_places, known_median, robust_std
 from wavebatch.core.units import ADJUSTED, AIR_ATTENUATION, HALF_C, MEDIAN_ERROR, WEEK, date_gps
 from wavebatch.core.waveforms import WaveformBlock
@@ -22,6 +22,9 @@ from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.sensor import SensorSource
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike  # a millisecond of each start
 
 SAMPLE = 2048
 """Waveforms whose light is summed."""

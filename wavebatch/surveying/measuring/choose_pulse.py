@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.order import distinct, quantile
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock

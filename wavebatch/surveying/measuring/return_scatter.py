@@ -8,11 +8,11 @@ of the returns, so that the smallest counts (docs/algorithms.md 6.1).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag
+from wavebatch.core.frozen import NamedTuple
 from wavebatch.core.order import distinct, even_places, median, quantile
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, SystemPulse, WaveformBlock

@@ -29,7 +29,7 @@ from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from wavebatch.batch.workers.futures import PATIENCE, WorkerDied, end_future, wa
 from wavebatch.batch.workers.spawned import Call, PipedProcess, start_early, take_early
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError, advise_install
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.order import join_ranges
 from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, option

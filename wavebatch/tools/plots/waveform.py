@@ -17,13 +17,12 @@ import math
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import field
-from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, nearest
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import NamedTuple, frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock

@@ -9,7 +9,9 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
+
+from wavebatch.core.frozen import NamedTuple
 
 NO_VALUE = "\u2013"
 """Shown on pages where there is no value."""
