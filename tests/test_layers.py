@@ -21,7 +21,8 @@ INSIDE = {
     ],
     "surveying/measuring": [
         {"noise_and_width"}, {"residuals"},
-        {"misfit", "learn_pulse", "judge", "return_scatter"}, {"joint_pulse", "mirror"}, {"choose_pulse", "whitening"},
+        {"misfit", "learn_pulse", "judge", "return_scatter"}, {"joint_pulse", "mirror", "places"},
+        {"choose_pulse", "whitening"},
     ],
     "batch/workers": [
         {"futures", "serve", "worker_check"}, {"spawned"}, {"processes"}, {"dask_cluster"},

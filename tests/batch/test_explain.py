@@ -165,6 +165,8 @@ def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
         ("quiet", 0.0, ("found too few samples without signal: the noise is a guess", "--system")),
         ("false_in_noise_share", 0.06, ("found that noise made 6 of 100 echoes: the noise is a guess", "level: draw")),
         ("false_in_noise_share", 0.02, ()),
+        ("placed_share", 0.05, ("found that 5 of 100 echoes repeat beside stronger ones", "a layer of the scene")),
+        ("placed_share", 0.02, ()),
         ("baseline_dn", -1.5, ("most of the noise below count 0: the noise is a guess",)),
     ],
 )

@@ -10,6 +10,7 @@ from strangers import judge_strip
 
 import wavebatch
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.order import distinct
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.surveying import survey_block
@@ -23,6 +24,7 @@ from wavebatch.surveying.measuring.misfit import (
     share_repeated,
     summarize_shares,
 )
+from wavebatch.surveying.measuring.places import share_placed
 from wavebatch.surveying.systems.known_systems import compare_pulses
 
 
@@ -183,6 +185,23 @@ def test_echoes_beside_stronger_ones_at_one_lag_and_ratio_are_counted_beyond_cha
     columns = (np.concatenate(pair) for pair in ((np.full(400, 30.0), 30 + lag), (np.full(400, 100.0), height)))
     echoes = EchoTable.build(np.tile(np.arange(400), 2), *columns, np.full(800, 2.0))
     assert share_repeated(echoes, 2.0) == pytest.approx(share, abs=0.03)
+
+
+@pytest.mark.parametrize("scene", ["part", "weak", "few", "canopy", "object", "layer", "high"])
+def test_echoes_at_one_place_of_lag_and_share_are_counted(rng, scene):
+    """A tenth of 600 echoes has one of 5 % 1.4 widths later, within errors of strong or of weak ones; not four of them,
+    nor in one part of the strip, nor at lags that scatter as targets do, nor of a share that only targets have."""
+    n, wide = 600, scene == "weak"
+    some = {"few": np.arange(0, n, 150), "object": np.arange(60), "canopy": np.arange(0)}
+    here = some.get(scene, np.arange(0, n, 10))
+    lag, share = rng.uniform(2, 30, n), np.exp(rng.uniform(np.log(0.01), 0, n))
+    lag[here] = 1.4 + {"weak": 0.25, "layer": 1.5}.get(scene, 0.1) * rng.standard_normal(len(here))
+    share[here] = (0.4 if scene == "high" else 0.05) * np.exp((0.35 if wide else 0.2) * rng.standard_normal(len(here)))
+    rows = distinct(np.r_[here, np.arange(0, n, 2)])
+    time, height = np.r_[np.full(n, 40.0), 40 + 2 * lag[rows]], 100 * np.r_[np.ones(n), share[rows]]
+    echoes = EchoTable.build(np.r_[np.arange(n), rows], time, height, np.full(len(time), 2.0))
+    number = share_placed(echoes, 2.0, n) * len(echoes)
+    assert 45 <= number <= 66 if scene in ("part", "weak") else not number
 
 
 @pytest.mark.parametrize(("number", "width", "share"), [(3, 2.0, 0.0), (50, 2.0, 0.09), (400, 2.0, 0.9), (400, 2.6, 0)])

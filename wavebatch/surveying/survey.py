@@ -61,6 +61,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_empty,
     thin_samples,
 )
+from wavebatch.surveying.measuring.places import share_placed
 from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, guess_growth, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
@@ -335,6 +336,7 @@ def _survey(
         covered = cover_faint(system, echoes, mirror.beside / max(mirror.echoes, 1))  # of another sample
         if covered is not system:
             system, echoes = covered, decompose_sample(part, covered)
+        figures.placed_share = share_placed(echoes, system.sigma_ref, len(part))
         fixed_share = share_fixed(echoes, len(part), block.spacing)
         figures.width_in_doubt = choice.spread
         # Neighbours too close to be found stay in the mirror too, but never beside so many of the strong echoes.

@@ -105,6 +105,8 @@ class Figures:
     """Of the echoes, in stretches without signal, by mirrored residuals; and of the strong ones, the false ones beside
     them that the pulse's misfit makes."""
     false_by_misfit_share: Share = None
+    placed_share: Share = None
+    """Of the echoes, at one lag and one share of stronger ones, beyond chance: parts of the pulse, or a layer."""
     echoes_in_doubt: Figure = None
     """Share of the echoes that another pulse, misfit or noise, as likely, does not find, or whose samples it misses."""
     width_in_doubt: Figure = None

@@ -237,6 +237,9 @@ MADE_BY_NOISE, LEAST_MADE = 0.03, 4
 for: it differs between waveforms, or a baseline is not level. The survey raises its significance at .75 %; of the six
 real strips 1 % are left at most, of simulated ones that were right .7 %."""
 
+MOST_PLACED = 0.03
+"""Share of the echoes that stand where parts of the pulse would, as many as may be false in a strip that is right."""
+
 
 def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Iterator[StripWarning]:
     """Say that pulse or noise is a guess: too few echoes to learn a pulse from, echoes that another one does not find,
@@ -273,6 +276,10 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         reason = f"that noise made {100 * made:.0f} of 100 echoes"
         remedy = "some waveforms may have more noise or interference, or baselines are not level: "
         remedy += "draw some with `wavebatch plot waveform`"
+    placed = figures.placed_share or 0.0
+    if placed > MOST_PLACED and not reason:
+        reason = f"that {100 * placed:.0f} of 100 echoes repeat beside stronger ones, as parts of a pulse do"
+        remedy = "a layer of the scene does so too: draw some with `wavebatch plot waveform`"
     if reason:
         code, guess = "pulse-guess", f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
         if unseen or hidden or noisy:

@@ -111,6 +111,7 @@ def _list_survey(survey: Survey, document: Mapping[str, Any]) -> Iterator[SheetP
         shares = figures.false_in_noise_share, figures.false_by_misfit_share
         by_noise, misfit = (f"{100 * share:.2g}" for share in shares)
         words = f"of 100 echoes about {by_noise} noise (in quiet); beside 100 strong ones about {misfit} of misfit"
+        words += f"; {100 * figures.placed_share:.2g} repeat beside stronger ones" if figures.placed_share else ""
         yield Fact("false echoes", words)
     yield Fact("kappa", f"{figures.kappa:z.4f}" if figures.kappa is not None else "not known")
     yield Fact("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
