@@ -170,6 +170,7 @@ def test_commands_import_only_what_they_use(tmp_path, tiny_strip, command, unuse
         f"print(sorted(set({unused.split()!r}) & sys.modules.keys()))"
     )
     plain = {name: value for name, value in os.environ.items() if not name.startswith("WAVEBATCH_")}
+    plain |= {"WAVEBATCH_RUN_JOBS": "1", "WAVEBATCH_JOBS": "1"}  # that `info` and `survey` read neither is no surprise
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=plain)
     assert done.stdout.splitlines()[-1] == "[]"
     assert command != "--help" or all(f"  {name}" in done.stdout for name in COMMANDS)

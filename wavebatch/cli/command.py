@@ -110,7 +110,9 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
     """What is wrong with variables of our name that no command reads."""
     given = [name for name in os.environ if name.startswith(PREFIX)]
     read = {name for option in _list_options(context.command).values() for name in option.envvar or ()}
-    if read.issuperset(given):  # nearly always: the other commands need not be imported
+    names = {one.words.name or name for name, one in OPTIONS.items() if name not in NO_VARIABLE}
+    read |= {f"{PREFIX}{command}{name}".replace("-", "_").upper() for name in names for command in ("", "RUN_")}
+    if read.issuperset(given):  # nearly always, if only `run` reads them: the other commands need not be imported
         return
     import difflib
 
