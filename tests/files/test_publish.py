@@ -196,12 +196,6 @@ def test_a_missing_folder_is_one_line(tmp_path):
         publish.Claim(tmp_path / "none", "strip")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_permission_is_one_line(tmp_path):
-    tmp_path.chmod(0o500)
-    refuses(InputError, "check the folder's permissions", Draft, tmp_path / "a", overwrite=False)
-
-
 def test_permission_error_names_the_remedy(tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -290,22 +284,25 @@ def places(tmp_path):
     return tmp_path
 
 
-def _names(arguments):
-    return [path.name for path in find_strips(arguments)]
-
-
-def test_a_folder_means_its_strips_by_name(places):
-    assert _names([str(places)]) == ["a.LAZ", "b.las"]
-
-
-def test_globs_mean_strips_only(places):
-    assert _names([str(places / "*")]) == ["a.LAZ", "b.las"]
-    assert _names([str(places / "**" / "*")]) == ["a.LAZ", "b.las", "c.laz"]
-
-
-def test_a_list_is_relative_to_itself_and_may_hold_all_of_it(places):
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        ([""], ["a.LAZ", "b.las"]),
+        (["*"], ["a.LAZ", "b.las"]),
+        (["**/*"], ["a.LAZ", "b.las", "c.laz"]),
+        (["@strips.txt"], ["b.las", "c.laz", "a.LAZ"]),
+        (["b.las", "", "sub/../b.las"], ["b.las", "a.LAZ"]),  # a strip counts once
+        (["x[1].las"], ["x[1].las"]),
+        (["none.las", "b.las"], ["none.las", "b.las"]),  # what is missing fails later and alone
+    ],
+)
+def test_folders_patterns_lists_and_names_mean_strips(places, arguments, found):
+    """Files of a folder by name; those of a list, which is relative to itself, in its order."""
     (places / "strips.txt").write_text("# night of the 21st\n\nb.las\nsub\n*.LAZ\n")
-    assert _names([f"@{places / 'strips.txt'}"]) == ["b.las", "c.laz", "a.LAZ"]
+    if "x[1].las" in arguments:
+        (places / "x[1].las").write_bytes(b"")
+    given = [f"{'@' * one.startswith('@')}{places}/{one.removeprefix('@')}" for one in arguments]
+    assert [path.name for path in find_strips(given)] == found
 
 
 @pytest.mark.parametrize("name", ["@-", "@/dev/stdin"])
@@ -314,10 +311,6 @@ def test_a_list_from_a_pipe_is_relative_to_where_the_command_runs(places, name):
     command = [sys.executable, "-m", "wavebatch", "check", name]
     done = subprocess.run(command, cwd=places, input="b.las\nsub\n", capture_output=True, text=True)
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["b.las", "sub/c.laz"]
-
-
-def test_a_strip_counts_once(places):
-    assert _names([str(places / "b.las"), str(places), str(places / "sub" / ".." / "b.las")]) == ["b.las", "a.LAZ"]
 
 
 def test_a_link_to_a_strip_that_was_given_is_named(places):
@@ -335,7 +328,7 @@ def test_a_folder_loses_no_file_without_a_word(places, monkeypatch):
     """A link to a disk that is not there, and a subfolder that may not be read: both were passed over, exit code 0."""
     (places / "far.las").symlink_to(places / "mnt" / "far.las")
     (places / "away.las").symlink_to(places / "away.las")
-    assert _names([str(places)]) == ["a.LAZ", "away.las", "b.las", "far.las"]
+    assert [path.name for path in find_strips([str(places)])] == ["a.LAZ", "away.las", "b.las", "far.las"]
     done = run_command("check", places)
     assert done.exit_code == 1 and "far.las: cannot be read: No such file" in done.stdout
     walk = os.walk
@@ -363,15 +356,6 @@ def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(
     arguments = [str(places), str(places / "sub")]
     assert [path.name for path in find_files(arguments)] == ["a.LAZ", "b.las", "b.laz", "c.laz"]
     refuses(ConfigError, "both outputs would be named b", find_strips, arguments)
-
-
-def test_a_name_with_brackets_is_a_name(places):
-    (places / "x[1].las").write_bytes(b"")
-    assert _names([str(places / "x[1].las")]) == ["x[1].las"]
-
-
-def test_a_named_file_that_is_missing_fails_later_and_alone(places):
-    assert _names([str(places / "none.las"), str(places / "b.las")]) == ["none.las", "b.las"]
 
 
 @pytest.mark.parametrize(
