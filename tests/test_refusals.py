@@ -197,6 +197,7 @@ FILES = [
         ("time,x,y,z\n1,2,3,4\n2,3,4,5\n", "do not overlap on any clock"),
         ("time,x,y,z\nonly,words,here,now\n", "no line of numbers, such as 12.5, follows the header in line 1"),
         ("time,x,y,z\n1,2,3,4\n", "1 usable positions"),
+        ("time,x,y,z\n3e14,2,3,4\n4e14,2,3,4\n", "with different times in seconds (up to 1e+12)"),
         ("time,lat,lon,h\n1,48,11,500\n2,48,11,500\n", "in degrees, but the strip has no CRS"))),
     *((f"{RUN} --trajectory t.csv", 2, f"t.csv: .. {words}", {"t.csv": text}) for text, words in (
         ("1,2,3,4\n5,6,7,8\n", "no line names the columns"), ("time,x,y\n1,2,3\n", "no line names the columns"),

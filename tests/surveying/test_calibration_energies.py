@@ -282,7 +282,7 @@ def test_calibrate_takes_the_pulses_that_a_condition_chooses(tmp_path, flickerin
     call(*calibrate, "--where", "x < 500049.5")
     assert load_calibration(tmp_path / "c.toml").constant == pytest.approx(known / 2, rel=0.005)
     done = call(*calibrate, "--where", "classification == 99")
-    assert done.exit_code == 1 and "field: 0 clean single echoes, 10 are needed" in done.stderr
+    assert done.exit_code == 1 and "10 are needed: no pulse that counts met it" in done.stderr
     done = call(*calibrate, "--where", "echo_width > 2")
     assert done.exit_code == 2 and "has no column 'echo_width'" in done.stderr
 

@@ -79,7 +79,10 @@ class Trajectory:
         rows = good[first]
         rows = rows[np.diff(time[rows], prepend=-np.inf) >= LEAST_STEP]
         if len(rows) < 2:
-            raise InputError(f"{len(rows)} usable positions of the sensor; at least two are needed")
+            raise InputError(
+                f"{len(rows)} usable positions of the sensor; at least two are needed, with different times in seconds "
+                f"(up to {LATEST:g}) and coordinates in metres (up to {FARTHEST:g})"
+            )
         time, xyz = time[rows], np.ascontiguousarray(xyz[rows])
         step = np.diff(time)
         gap = max(LONGEST_GAP, GAP_STEPS * float(np.median(step))) if gap is None else gap

@@ -685,8 +685,8 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
             )
         raise InputError(
             f"{share} of the trajectory's rays are {np.degrees(off):.1f} degrees off the packets' vectors: it belongs "
-            "to another strip, or to a part of this one, has another CRS, or its clock is off by seconds (UTC is 18 s "
-            "less than GPS time)"
+            "to another strip, or to a part of this one, has another CRS or unit, or its clock is off by seconds (UTC "
+            "is 18 s less than GPS time)"
         )
     return angle
 

@@ -224,7 +224,8 @@ def measure_target(
         return replace(blank, refused=reason), *nothing
     rows = rows[~clipped]
     if len(rows) < LEAST_ECHOES:
-        return replace(blank, refused=f"{len(rows)} clean single echoes, {LEAST_ECHOES} are needed"), *nothing
+        why = "" if len(clipped) else ": no pulse that counts met it with one echo; check its place and size"
+        return replace(blank, refused=f"{len(rows)} clean single echoes, {LEAST_ECHOES} are needed{why}"), *nothing
     facet = fit_facet(rows["xyz"], rows["ray"])
     seen, seen_err = float(np.median(facet.angles(rows["ray"]))), float(np.hypot(facet.angle_error, GIVEN_ANGLE_ERROR))
     if target.incidence is not None and abs(np.radians(target.incidence) - seen) > MOST_OFF * seen_err:
