@@ -85,26 +85,24 @@ ALIKE_NOISE, ALIKE_LEVEL = 1.15, 0.5
 def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
     """The samples of each descriptor as one block; the largest first.
 
-    Waveforms of several lengths are filled up to the longest, with the fill marked as missing. Samples of long
-    waveforms count up to 256 each: it takes many waveforms to learn a pulse.
+    Waveforms of several lengths are filled up to the longest, with the fill marked as missing; copies of waveforms are
+    left out. Samples of long waveforms count up to 256 each: it takes many waveforms to learn a pulse.
     """
     groups: dict[int, list[WaveformBlock]] = {}
     for block in blocks:
         if len(block):
             groups.setdefault(block.digitizer.index, []).append(block)
-    joined = [_drop_copies(pool_blocks(group)) for _, group in sorted(groups.items())]
+    joined = []
+    for _, group in sorted(groups.items()):
+        block = pool_blocks(group)
+        # Some files hold a waveform for each return of a pulse: what is seen three times is known no better, but looks
+        # as if it were. Flat waveforms may be alike by chance.
+        rising = np.flatnonzero(np.ptp(block.samples, axis=1) >= LEAST_RISE)
+        rows = np.ascontiguousarray(block.samples[rising])
+        _, first = np.unique(rows.view(f"V{rows.itemsize * rows.shape[1]}")[:, 0], return_index=True)
+        copies = np.delete(rising, first)
+        joined.append(block.rows(np.delete(np.arange(len(block)), copies)) if len(copies) else block)
     return sorted(joined, key=weigh, reverse=True)
-
-
-def _drop_copies(block: WaveformBlock) -> WaveformBlock:
-    """A block without waveforms that are copies of others: some files hold one for each return of a pulse.
-
-    What is seen three times is known no better, but looks as if it were. Flat waveforms may be alike by chance.
-    """
-    rising = np.flatnonzero(np.ptp(block.samples, axis=1) >= LEAST_RISE)
-    rows = np.ascontiguousarray(block.samples[rising])
-    _, first = np.unique(rows.view(f"V{rows.itemsize * rows.shape[1]}")[:, 0], return_index=True)
-    return block if len(first) == len(rows) else block.rows(np.delete(np.arange(len(block)), np.delete(rising, first)))
 
 
 def pool_blocks(group: list[WaveformBlock]) -> WaveformBlock:
