@@ -692,6 +692,14 @@ def test_strips_that_are_wrong_are_doubted(number, tmp_path):
     assert result["right"] or "in doubt" in result["doubts"][0]
 
 
+@pytest.mark.quick_cases("7094")
+@pytest.mark.parametrize("number", [7077, 7091, 7094])
+def test_far_tails_that_go_down_are_no_noise(number, tmp_path):
+    """Echoes of 10,000 to 50,000 noises: 'noise made 100, 47 and 6 of 100 echoes' of strips that are right."""
+    result = judge_strip(number, tmp_path)
+    assert result["right"] and not result["doubts"]
+
+
 def test_parts_of_a_pulse_that_repeat_are_said(tmp_path):
     """A skewed pulse that is stretched by some percent: a tenth of its echoes has a part of it 1.4 widths later, nobody
     knew that 7 % were false."""

@@ -36,7 +36,7 @@ from wavebatch.surveying.measuring.judge import (
     replace_rows,
     sample_noise,
 )
-from wavebatch.surveying.measuring.mirror import Mirror, count_holes, look_in_mirror
+from wavebatch.surveying.measuring.mirror import FALSE_QUIET, Mirror, count_holes, look_in_mirror
 from wavebatch.surveying.measuring.misfit import LEAST_MISFIT, limit_faint
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, spread_rows, thin_block
 from wavebatch.surveying.systems.known_systems import MOST_SPREAD
@@ -128,10 +128,6 @@ COUNTED = 0.3
 FIRST_CHANGE = 0.01
 """Change of the pulse from shot to shot, at least, in the first round of each: what the pulse of a stack misses must
 not become echoes, which would keep the shoulders of the next one as wrong."""
-
-FALSE_QUIET = 0.0075
-"""Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
-threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
 
 SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.5, 6.5
 """Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""

@@ -33,6 +33,10 @@ that of the waveform [full widths at half maximum]."""
 WORTH = 0.2
 """Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
 
+FALSE_QUIET = 0.0075
+"""Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
+threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
+
 HAIR = 0.05
 """Noises from a whole count up to which a sample of the mirror is one. In noise of less than a count few patterns of
 counts are near a threshold, and a level .01 counts from a half put 57 that were found just below it in the mirror."""
@@ -107,12 +111,23 @@ def look_in_mirror(
         rest = other.take(np.flatnonzero(alone))
         energy = rest.amplitude * np.sqrt(rest.sigma) * unit
         beside, quiet = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
-        false.append((energy[beside], energy[quiet]))
-        if system.noise.quiet < FINE:
+        down = energy[quiet]
+        # Only where it decides: the waveforms are decomposed once more.
+        many = len(down) > FALSE_QUIET * len(echoes)
+        if many or system.noise.quiet < FINE:
             own = find_echoes(block, system, detect, **options)[2]
-            energy = own.amplitude * np.sqrt(own.sigma) * unit
-            low = own.amplitude < STEP
-            steps.append((energy[low], energy[~low & (own.amplitude < 2 * STEP)]))
+            up = own.amplitude * np.sqrt(own.sigma) * unit
+            if many:
+                # Noise makes no more than there are of that size, within a factor of two: what only goes down makes
+                # none, as tails of echoes of 10,000 noises, far from them.
+                down, octaves = np.sort(down), np.sort(np.frexp(up)[1])
+                octave = np.frexp(down)[1]
+                number = np.searchsorted(octaves, octave, "right") - np.searchsorted(octaves, octave)
+                down = down[np.arange(len(down)) - np.searchsorted(octave, octave) < number]
+            if system.noise.quiet < FINE:
+                low = own.amplitude < STEP
+                steps.append((up[low], up[~low & (own.amplitude < 2 * STEP)]))
+        false.append((energy[beside], down))
     energy = echoes.amplitude * np.sqrt(echoes.sigma) * unit
     for level in levels:
         most = [max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True)]
