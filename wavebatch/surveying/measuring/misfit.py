@@ -198,7 +198,8 @@ def cover_faint(system: SystemPulse, echoes: EchoTable, mirrored: float) -> Syst
     -------
     SystemPulse
     """
-    row, other, distance = _list_distances(echoes, system.sigma_ref)
+    row, other, lag = list_lags(echoes, system.sigma_ref)
+    distance = np.abs(lag)
     ratio = echoes.amplitude[row] / echoes.amplitude[other]
     faint = ratio < MOST_FAINT
     nearest = np.full(len(echoes), np.inf)
@@ -237,7 +238,8 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     if np.count_nonzero(clear) < FEW:
         return system.misfit, 0.0
-    row, _, distance = _list_distances(echoes, system.sigma_ref)
+    row, _, lag = list_lags(echoes, system.sigma_ref)
+    distance = np.abs(lag)
     apart = np.count_nonzero(clear[row] & (distance >= APART[0]) & (distance < APART[1]))
     hidden = UNEXPLAINED * min(apart / np.count_nonzero(clear) / NEIGHBOURS, 1.0)
     alone = clear & echoes.alone(int(echoes.waveform.max()) + 1)
@@ -272,7 +274,8 @@ def suspect_pairs(echoes: EchoTable, width: float) -> bool:
     """
     doubtful = (echoes.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
     doubtful &= echoes.amplitude < JUST * PROVEN * echoes.amplitude_err
-    row, _, distance = _list_distances(echoes, width)
+    row, _, lag = list_lags(echoes, width)
+    distance = np.abs(lag)
     proven = np.count_nonzero(doubtful[row] & (distance < APART[0]))
     apart = np.count_nonzero((distance >= APART[0]) & (distance < APART[1]))
     return bool(proven > MOST_PROVEN * apart / 2)
@@ -325,8 +328,8 @@ def share_merged(echoes: EchoTable, width: float) -> float:
 
     A pulse that changes from shot to shot, or that is stretched where its model is made rounder, is described by two.
     """
-    row, other, distance = _list_distances(echoes, width)
-    near = (distance < NOT_TOLD) & (np.maximum(echoes.sigma[row], echoes.sigma[other]) < AS_NARROW * width)
+    row, other, lag = list_lags(echoes, width)
+    near = (np.abs(lag) < NOT_TOLD) & (np.maximum(echoes.sigma[row], echoes.sigma[other]) < AS_NARROW * width)
     number = len(distinct(row[near]))
     return max(number - SURE * float(np.sqrt(number)), 0.0) / max(len(echoes), 1)
 
@@ -339,21 +342,17 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
     the peak that no pulse is learned there. Two layers of one distance do not scatter as one. A part that changes from
     shot to shot has one lag, within a fraction of a width; layers of a scene have others beside it too.
     """
-    pairs, weak = [], [np.empty(0)]
-    for row, other, lag in list_neighbours(echoes):
-        ratio = echoes.amplitude[row] / echoes.amplitude[other]
-        near = (ratio < WEAKER) & (np.abs(lag) < REACH * width)
-        weak.append(lag[ratio < WEAKER / 2] / width)
-        pairs.append(np.stack([lag[near] / width, log(ratio[near])]))
-    lags, ratios = np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
-    most = 0.0
+    row, other, lag = list_lags(echoes, width)
+    ratio = echoes.amplitude[row] / echoes.amplitude[other]
+    near = (ratio < WEAKER) & (np.abs(lag) < REACH)
+    lags, ratios, most = lag[near], log(ratio[near]), 0.0
     for centre in np.arange(-REACH, REACH, 0.5):
         here = np.abs(lags - centre) <= 1
         if np.count_nonzero(here) >= FEW:
             alike = np.abs(ratios - median(ratios[here])) < SAME_RATIO
             chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
             most = max(most, 2 * float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
-    lag = np.sort(np.concatenate(weak))
+    lag = np.sort(lag[ratio < WEAKER / 2])
     first, last = (lag[0], lag[-1]) if len(lag) else (0.0, 0.0)
     centre = np.arange(first, last + SAME_LAG, SAME_LAG / 2)
     centre = centre[np.abs(centre) >= NEAREST]
@@ -408,13 +407,13 @@ def share_fixed(echoes: EchoTable, number: int, spacing: float) -> float:
     return float(np.mean(here)) if others else 0.0
 
 
-def _list_distances(echoes: EchoTable, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of echoes that have a neighbour, its row, and its distance [widths]: each pair from both sides."""
-    pairs = [(row, other, np.abs(lag) / width) for row, other, lag in list_neighbours(echoes)]
+def list_lags(echoes: EchoTable, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of echoes that have a neighbour, its row, and how much later they are than it [widths]: from both sides."""
+    pairs = [(row, other, lag / width) for row, other, lag in list_neighbours(echoes)]
     if not pairs:
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    row, other, distance = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    return row, other, distance
+    row, other, lag = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return row, other, lag
 
 
 def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -> SystemPulse:
@@ -486,12 +485,10 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     strong = strong[echoes.amplitude[strong] * LESS * PART > found]
     number = np.full(len(echoes), -1)
     number[strong] = np.arange(len(strong))
-    pairs = [(number[other], echoes.amplitude[row] / echoes.amplitude[other], lag / ref)
-             for row, other, lag in list_neighbours(echoes)]  # fmt: skip
-    if not pairs:
-        return system
-    owner, share, lag = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    owner, share, lag = (column[owner >= 0] for column in (owner, share, lag))
+    row, other, lag = list_lags(echoes, ref)
+    known = number[other] >= 0
+    owner, lag = number[other[known]], lag[known]
+    share = echoes.amplitude[row[known]] / echoes.amplitude[other[known]]
     least, time = found / echoes.amplitude[strong], echoes.time[strong]
     tenth = 10 * echoes.waveform[strong].astype(np.int64) // len(block)
     low, high = -time / ref, ((block.samples.shape[1] - 1) * block.spacing - time) / ref

@@ -11,9 +11,8 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import distinct
 from wavebatch.kernels.elementary import log
-from wavebatch.stages.flags import list_neighbours
 from wavebatch.surveying.measuring.judge import SURE
-from wavebatch.surveying.measuring.misfit import PART, PLACES, REPEATED, TAIL_AFTER
+from wavebatch.surveying.measuring.misfit import PART, PLACES, REPEATED, TAIL_AFTER, list_lags
 
 CELLS = (0.3, 0.4), (0.5, 0.7)
 """Half a place: in lags [widths of the pulse] and in logarithms of shares. Strong echoes show parts of a pulse in the
@@ -38,13 +37,10 @@ def share_placed(echoes: EchoTable, width: float, waveforms: int) -> float:
     waveforms : int
         Of the sample: a place must be seen in three tenths of it, as an object lies in one or two.
     """
-    pairs = [np.empty((3, 0))]
-    for row, other, lag in list_neighbours(echoes):
-        ratio = echoes.amplitude[row] / echoes.amplitude[other]
-        here = (ratio < 1) & (ratio > LEAST_SHARE) & (np.abs(lag) < TAIL_AFTER * width)
-        pairs.append(np.stack([row[here], lag[here] / width, -log(ratio[here])]))
-    row, lag, depth = np.concatenate(pairs, axis=1)
-    row = row.astype(np.int64)
+    row, other, lag = list_lags(echoes, width)
+    ratio = echoes.amplitude[row] / echoes.amplitude[other]
+    near = (ratio < 1) & (ratio > LEAST_SHARE) & (np.abs(lag) < TAIL_AFTER)
+    row, lag, depth = row[near], lag[near], -log(ratio[near])
     tenth = 10 * echoes.waveform[row].astype(np.int64) // waveforms
     placed = np.zeros(len(row), bool)
     for long, deep in CELLS:
