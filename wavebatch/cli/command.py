@@ -109,6 +109,8 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
 def _find_strangers(context: click.Context) -> Iterator[str]:
     """What is wrong with variables of our name that no command reads."""
     given = [name for name in os.environ if name.startswith(PREFIX)]
+    if not given:
+        return
     read = {name for option in _list_options(context.command).values() for name in option.envvar or ()}
     names = {one.words.name or name for name, one in OPTIONS.items() if name not in NO_VARIABLE}
     read |= {f"{PREFIX}{command}{name}".replace("-", "_").upper() for name in names for command in ("", "RUN_")}
