@@ -58,6 +58,9 @@ class UnitEchoes:
     """Away from the sensor, per packet [m/ns], f8 (packets, 3)."""
     origin: np.ndarray
     """Position of the first sample of each packet from the raw return location [m], f8 (packets, 3)."""
+    digitizer: np.ndarray
+    """Descriptor of each packet, u1 (packets,); the first of those that differ in their number of samples only, as some
+    sensors have one per length. Two of one length are two channels."""
 
 
 @frozen(eq=False)
@@ -123,9 +126,13 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     """
     n = len(unit.packets.owned)
     times_read = np.zeros(n, np.int64)
-    direction, origin = np.zeros((n, 3)), np.zeros((n, 3))
+    direction, origin, digitizer = np.zeros((n, 3)), np.zeros((n, 3)), unit.packets.digitizer.copy()
     tables, nearest = [], [np.empty(0, np.int64)]
+    kinds: dict[tuple[float, ...], dict[int, int]] = {}
     for block, index, table in results:
+        one = block.digitizer
+        lengths = kinds.setdefault((one.bits, one.spacing, one.gain, one.offset), {})
+        lengths[one.index] = max(one.n_samples, lengths.get(one.index, 0))
         times_read += np.bincount(index, minlength=n)
         direction[index], origin[index] = block.direction, block.origin
         near = table.attributes["point"].astype(np.int64)
@@ -148,7 +155,10 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     if np.any(np.diff(table.waveform) < 0):  # blocks of several digitizers or lengths
         order = np.argsort(table.waveform, kind="stable")
         table, near = table.take(order), near[order]
-    return UnitEchoes(table, near, times_read > 0, direction, origin)
+    for lengths in kinds.values():
+        if len(set(lengths.values())) == len(lengths):
+            digitizer[np.isin(digitizer, list(lengths))] = min(lengths)
+    return UnitEchoes(table, near, times_read > 0, direction, origin, digitizer)
 
 
 def assemble_echoes(
@@ -393,7 +403,7 @@ def find_shared(unit: Unit, echoes: UnitEchoes, header: LasHeader) -> np.ndarray
     rows = np.flatnonzero(packets.owned)
     key = np.full(len(packets), -1)
     pulse = _find_pulses(unit, echoes, header)[packets.owner[rows] - unit.start]
-    key[rows] = 256 * pulse + packets.digitizer[rows]
+    key[rows] = 256 * pulse + echoes.digitizer[rows]
     own = np.flatnonzero(key[table.waveform] >= 0)
     packet = table.waveform[own]
     first, group = np.unique(key[packet], return_index=True, return_inverse=True)[1:]
@@ -425,7 +435,7 @@ def _find_copies(unit: Unit, echoes: UnitEchoes, pulse: np.ndarray) -> np.ndarra
     rows = rows[np.bincount(key[rows], minlength=len(pulse))[key[rows]] > 1]
     if not len(rows):
         return copied
-    key = key * 256 + packets.digitizer
+    key = key * 256 + echoes.digitizer
     first, group = np.unique(key[rows], return_index=True, return_inverse=True)[1:]
     head, shift = rows[first][group], np.full(len(packets), np.nan)
     shift[rows] = along_ray(echoes.origin[rows], echoes.origin[head], echoes.direction[head])
