@@ -13,17 +13,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
-from wavebatch.tools.simulate import PulseModel, Recording, Scene, shape_pulse
-from wavebatch.tools.simulate.scenes import (
-    Draw,
-    Drawn,
-    draw_broad,
-    draw_constant,
-    draw_contrast,
-    draw_crowd,
-    draw_huge,
-    tabulate_echoes,
-)
+from wavebatch.tools.simulate import PulseModel, Recording, Scene, scenes, shape_pulse
 
 SIGMA = 2.0
 """Width of the system pulse in all cases [ns]."""
@@ -36,7 +26,7 @@ class Case:
     hazard: str
     """H1 ... H16."""
     name: str
-    draw: Draw
+    draw: scenes.Draw
     recording: Recording = field(default_factory=Recording)
 
 
@@ -46,7 +36,7 @@ class CaseScene(Scene):
 
     case: Case | None = None
 
-    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
+    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> scenes.Drawn:
         """Echoes of n waveforms."""
         return self.case.draw(rng, n, self.recording)
 
@@ -58,29 +48,29 @@ def make_scene(case: Case) -> CaseScene:
 
 def draw_echoes(
     rng: np.random.Generator, n: int, recording: Recording, *, heights: tuple[float, ...], gap: float = 0.0
-) -> Drawn:
+) -> scenes.Drawn:
     """Echoes of the system's width and the given heights [count], `gap` widths apart, away from the ends."""
     s, k = recording.pulse.sigma, len(heights)
     middle = rng.uniform(12 * s, recording.duration - 12 * s, (n, 1))
     time = middle + gap * s * (np.arange(k) - 0.5 * (k - 1))
-    return tabulate_echoes(time, np.array(heights, np.float64), s)
+    return scenes.tabulate_echoes(time, np.array(heights, np.float64), s)
 
 
-def draw_between(rng: np.random.Generator, n: int, recording: Recording, *, low: float, high: float) -> Drawn:
+def draw_between(rng: np.random.Generator, n: int, recording: Recording, *, low: float, high: float) -> scenes.Drawn:
     """One echo of the system's width between two heights [count], evenly over their logarithm."""
     s = recording.pulse.sigma
     time = rng.uniform(12 * s, recording.duration - 12 * s, (n, 1))
-    return tabulate_echoes(time, np.exp(rng.uniform(np.log(low), np.log(high), (n, 1))), s)
+    return scenes.tabulate_echoes(time, np.exp(rng.uniform(np.log(low), np.log(high), (n, 1))), s)
 
 
-def draw_at_edge(rng: np.random.Generator, n: int, recording: Recording, *, inside: float) -> Drawn:
+def draw_at_edge(rng: np.random.Generator, n: int, recording: Recording, *, inside: float) -> scenes.Drawn:
     """One echo of 100 counts whose centre lies `inside` widths, plus or minus half a sample, from an end."""
     distance = inside * recording.pulse.sigma + rng.uniform(-0.5, 0.5, (n, 1)) * recording.spacing
     time = np.where(rng.random((n, 1)) < 0.5, distance, recording.duration - distance)
-    return tabulate_echoes(time, 100.0, recording.pulse.sigma)
+    return scenes.tabulate_echoes(time, 100.0, recording.pulse.sigma)
 
 
-def draw_clipped(rng: np.random.Generator, n: int, recording: Recording, *, level: float) -> Drawn:
+def draw_clipped(rng: np.random.Generator, n: int, recording: Recording, *, level: float) -> scenes.Drawn:
     """One echo of which the receiver records only the share `level` of its height."""
     return draw_echoes(rng, n, recording, heights=((recording.clip - recording.baseline) / level,))
 
@@ -104,7 +94,7 @@ def _list_cases() -> Iterator[Case]:
     for level in (0.95, 0.8, 0.64, 0.5, 0.3):
         yield Case("H6", f"clipped at {level:.0%} of its height", partial(draw_clipped, level=level), clipping)
     yield Case("H6", "clipped at 50%, none in the survey", partial(draw_clipped, level=0.5), base)
-    yield Case("H6", "5 to 500 times the range", draw_huge, clipping)
+    yield Case("H6", "5 to 500 times the range", scenes.draw_huge, clipping)
     for ring in (0.01, 0.02, 0.03):
         ringing = replace(base, pulse=shape_pulse(base.pulse, ringing=ring))
         yield Case("H7", f"ringing {ring:.0%}", one(heights=(200.0,)), ringing)
@@ -112,15 +102,15 @@ def _list_cases() -> Iterator[Case]:
         yield Case("H8", f"centre {inside:g} s inside", partial(draw_at_edge, inside=inside), base)
     quiet = replace(base, noise_std=0.5, baseline_spread=0.1)
     yield Case("H9", "2 to 6 DN, noise 0.5", partial(draw_between, low=2.0, high=6.0), quiet)
-    yield Case("H10", "constant 0, 12 or 255", draw_constant, base)
+    yield Case("H10", "constant 0, 12 or 255", scenes.draw_constant, base)
     yield Case("H10", "noise only", one(heights=()), base)
     for rho in (0.5, 0.667, 0.8):
         yield Case("H11", f"noise of rho {rho:.2g}", one(heights=(60.0,)), replace(base, rho=rho))
     for gain in (0.05, 0.1):
         yield Case("H12", f"variance +{gain:g} per DN", one(heights=(150.0,)), replace(base, noise_gain=gain))
-    yield Case("H16", "2.5 to 4 times as wide", draw_broad, base)
-    yield Case("H16", "weak beside strong", draw_contrast, base)
-    yield Case("H16", "eight echoes", draw_crowd, base)
+    yield Case("H16", "2.5 to 4 times as wide", scenes.draw_broad, base)
+    yield Case("H16", "weak beside strong", scenes.draw_contrast, base)
+    yield Case("H16", "eight echoes", scenes.draw_crowd, base)
 
 
 CASES: tuple[Case, ...] = tuple(_list_cases())

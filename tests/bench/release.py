@@ -20,15 +20,7 @@ from bench.system import measure_system
 
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.tools.api import AUTO
-from wavebatch.tools.bench.command import (
-    BenchOptions,
-    BenchProgress,
-    bench_sheet,
-    list_methods,
-    load_chains,
-    run_bench,
-    write_outputs,
-)
+from wavebatch.tools.bench import command
 from wavebatch.tools.sheets.sheet import list_lines
 
 SCENES = ("mixed", "open", "forest", "empty")
@@ -38,10 +30,10 @@ STABILITY_WAVEFORMS, STABILITY_SURVEY = 900, 3072
 
 
 def measure_release(
-    options: BenchOptions, cases: Sequence[Case], large: bool, progress: BenchProgress
+    options: command.BenchOptions, cases: Sequence[Case], large: bool, progress: command.BenchProgress
 ) -> dict[str, Any]:
     """The document of `run_bench` with rows of other decomposers, `stability`, `system` and `promises`."""
-    document = run_bench(options, progress, lambda scene, groups: measure_peers(scene, groups, progress))
+    document = command.run_bench(options, progress, lambda scene, groups: measure_peers(scene, groups, progress))
     document["failure_kinds"] = FAILURES
     document["stability"] = measure_cases(options, cases, progress)
     pulses = 2 * max(options.pulses, 1000)
@@ -51,11 +43,12 @@ def measure_release(
 
 
 def measure_cases(
-    options: BenchOptions, cases: Sequence[Case], progress: BenchProgress, waveforms: int = STABILITY_WAVEFORMS
+    options: command.BenchOptions, cases: Sequence[Case], progress: command.BenchProgress,
+    waveforms: int = STABILITY_WAVEFORMS,
 ) -> list[dict[str, Any]]:
     """The stiff cases by all chains of the options."""
-    methods = list_methods() if options.all_methods else {}
-    measured = load_chains(options.chains) | methods
+    methods = command.list_methods() if options.all_methods else {}
+    measured = command.load_chains(options.chains) | methods
     return measure_stability(
         lambda survey: {**measured, AUTO: choose_chain(survey)},
         waveforms,
@@ -69,7 +62,7 @@ def measure_cases(
 
 def format_release(document: dict[str, Any]) -> str:
     """All tables."""
-    tables = ["\n".join(list_lines(bench_sheet(document)))]
+    tables = ["\n".join(list_lines(command.bench_sheet(document)))]
     tables += [format_stability(document["stability"]), format_promises(document["promises"])]
     return "\n\n".join(tables)
 
@@ -92,7 +85,7 @@ def read_options(words: Sequence[str] | None = None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> None:
     """Measures, prints the tables and writes the files."""
     given = read_options(words)
-    options = BenchOptions(
+    options = command.BenchOptions(
         scenes=tuple(given.scene or SCENES),
         all_methods=given.all_methods,
         seed=given.seed,
@@ -104,7 +97,7 @@ def main(words: Sequence[str] | None = None) -> None:
     document = measure_release(options, list_cases(given.hazard), given.large, progress)
     text = format_release(document)
     print(text)
-    for line in write_outputs(document, text, given.output):
+    for line in command.write_outputs(document, text, given.output):
         print(line, file=sys.stderr)
 
 

@@ -9,15 +9,7 @@ import pytest
 from commands import refuses
 
 from wavebatch.cli.messages import format_json
-from wavebatch.core.echoes import (
-    FLAG_MEANINGS,
-    EchoFlag,
-    EchoTable,
-    NoData,
-    count_reasons,
-    explain_no_data,
-    without_nan,
-)
+from wavebatch.core import echoes
 from wavebatch.core.errors import StageError
 from wavebatch.core.units import format_measure, format_relative
 
@@ -25,7 +17,7 @@ from wavebatch.core.units import format_measure, format_relative
 def make_table(waveforms, shift=0.0, **attributes):
     m = len(waveforms)
     number = np.arange(m, dtype=np.float64)
-    return EchoTable.build(
+    return echoes.EchoTable.build(
         np.array(waveforms), number + shift, 10 * number, 1 + number, time_err=0.1 * number, attributes=attributes
     )
 
@@ -58,18 +50,18 @@ def test_build_sorts_and_converts():
 
 def test_build_refuses_unknown_columns():
     with pytest.raises(TypeError, match="height"):
-        EchoTable.build(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1), height=np.zeros(1))
+        echoes.EchoTable.build(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1), height=np.zeros(1))
 
 
 def test_concatenate_with_and_without_shifts():
     first, second = make_table([0, 1], x=np.array([1.0, 2.0])), make_table([0], 5.0, x=np.array([3.0]))
-    joined = EchoTable.concatenate([first, (second, 2)])
+    joined = echoes.EchoTable.concatenate([first, (second, 2)])
     assert joined.waveform.tolist() == [0, 1, 2]
     assert joined.waveform.dtype == np.int32
     assert joined.attributes["x"].tolist() == [1.0, 2.0, 3.0]
-    assert EchoTable.concatenate([first, second]).waveform.tolist() == [0, 1, 0]
-    assert len(EchoTable.concatenate([])) == 0
-    refuses(StageError, "different columns", EchoTable.concatenate, [first, make_table([0])])
+    assert echoes.EchoTable.concatenate([first, second]).waveform.tolist() == [0, 1, 0]
+    assert len(echoes.EchoTable.concatenate([])) == 0
+    refuses(StageError, "different columns", echoes.EchoTable.concatenate, [first, make_table([0])])
 
 
 def test_attributes_must_fit_the_table():
@@ -77,26 +69,27 @@ def test_attributes_must_fit_the_table():
 
 
 def test_flags_are_single_bits_with_a_meaning():
-    assert [int(flag) for flag in EchoFlag] == [1 << bit for bit in range(16)]
-    assert all(FLAG_MEANINGS[flag] == flag.meaning for flag in EchoFlag)
-    both = EchoFlag.WEAK | EchoFlag.MERGED
+    assert [int(flag) for flag in echoes.EchoFlag] == [1 << bit for bit in range(16)]
+    assert all(echoes.FLAG_MEANINGS[flag] == flag.meaning for flag in echoes.EchoFlag)
+    both = echoes.EchoFlag.WEAK | echoes.EchoFlag.MERGED
     assert pickle.loads(pickle.dumps(both)) == both == 4128
 
 
 def test_json_has_null_for_what_is_no_number():
     given = {1: math.nan, "b": [np.float64("inf"), 2, np.float32(0.5)], "c": ("x", None, True, -math.inf)}
     expected = {"1": None, "b": [None, 2, 0.5], "c": ["x", None, True, None]}
-    assert without_nan(given) == expected
+    assert echoes.without_nan(given) == expected
     assert json.loads(format_json(given), parse_constant=pytest.fail) == expected
 
 
 def test_the_first_reason_that_applies_is_given_and_counted():
     values = np.array([1.0, np.nan, np.nan, np.nan])
     unplaced = np.array([True, True, False, False])
-    codes = explain_no_data(values, (NoData.NO_SENSOR, unplaced), (NoData.CUT, values != values))
-    assert codes.tolist() == [NoData.KNOWN, NoData.NO_SENSOR, NoData.CUT, NoData.CUT]
-    assert count_reasons({"range": values, "range_reason": codes}) == {"range": {"KNOWN": 1, "NO_SENSOR": 1, "CUT": 2}}
-    assert explain_no_data(values, (NoData.CUT, False))[1] == NoData.OTHER
+    codes = echoes.explain_no_data(values, (echoes.NoData.NO_SENSOR, unplaced), (echoes.NoData.CUT, values != values))
+    assert codes.tolist() == [echoes.NoData.KNOWN, echoes.NoData.NO_SENSOR, echoes.NoData.CUT, echoes.NoData.CUT]
+    found = echoes.count_reasons({"range": values, "range_reason": codes})
+    assert found == {"range": {"KNOWN": 1, "NO_SENSOR": 1, "CUT": 2}}
+    assert echoes.explain_no_data(values, (echoes.NoData.CUT, False))[1] == echoes.NoData.OTHER
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,7 @@ from given_echoes import FINE, fine_recording, known_noise, known_system, simula
 from published import WANG_CASES, simulate_wang
 
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
-from wavebatch.kernels.signal.deconvolve import (
-    convolve_pulse,
-    correlate_pulse,
-    deconvolve_gold,
-    deconvolve_richardson_lucy,
-    deconvolve_wiener,
-)
+from wavebatch.kernels.signal import deconvolve
 from wavebatch.kernels.signal.filters import b3_detail, b3_gain, b3_level
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.detect.transformed import transform
@@ -107,8 +101,8 @@ def test_gain_of_noise_and_impulse_response_of_the_specification():
 def test_pulses_are_put_at_samples_and_back(taps, s):
     signal = np.random.default_rng(s).standard_normal((s, 3))
     matrix = naive.pulse_matrix(s, taps)
-    np.testing.assert_allclose(convolve_pulse(signal, taps), matrix @ signal, atol=1e-6)
-    np.testing.assert_allclose(correlate_pulse(signal, taps), matrix.T @ signal, atol=1e-6)
+    np.testing.assert_allclose(deconvolve.convolve_pulse(signal, taps), matrix @ signal, atol=1e-6)
+    np.testing.assert_allclose(deconvolve.correlate_pulse(signal, taps), matrix.T @ signal, atol=1e-6)
 
 
 @pytest.mark.parametrize("taps", [GAUSS, SKEWED], ids=["symmetric", "skewed"])
@@ -117,9 +111,9 @@ def test_deconvolutions_equal_their_plain_twins(taps):
     truth = np.zeros((50, 4))
     truth[[12, 20, 31, 40], [0, 1, 1, 3]] = 80
     signal = naive.pulse_matrix(50, taps) @ truth + rng.standard_normal((50, 4))
-    fast = deconvolve_richardson_lucy(signal, taps, np.full(4, 3.0), 12)
+    fast = deconvolve.deconvolve_richardson_lucy(signal, taps, np.full(4, 3.0), 12)
     np.testing.assert_allclose(fast, np.stack([naive.richardson_lucy(y, taps, 3, 12) for y in signal.T], 1), atol=1e-4)
-    gold = deconvolve_gold(signal[:, [0, 1, 3]], taps, 8)
+    gold = deconvolve.deconvolve_gold(signal[:, [0, 1, 3]], taps, 8)
     plain = np.stack([naive.gold(y, taps, 8) for y in signal.T[[0, 1, 3]]], axis=1)
     np.testing.assert_allclose(gold, plain, rtol=1e-4, atol=1e-3)
 
@@ -129,20 +123,20 @@ def test_acceleration_is_worth_iterations():
     truth = np.zeros((60, 1))
     truth[[25, 30]] = 80
     signal = naive.pulse_matrix(60, GAUSS) @ truth
-    fast = deconvolve_richardson_lucy(signal, GAUSS, np.array([3.0]), 16)
+    fast = deconvolve.deconvolve_richardson_lucy(signal, GAUSS, np.array([3.0]), 16)
     plain = naive.richardson_lucy(signal[:, 0], GAUSS, 3.0, 60, accelerate=False)[:, None]
-    misfit, of_plain = (np.abs(convolve_pulse(profile, GAUSS) - signal).sum() for profile in (fast, plain))
+    misfit, of_plain = (np.abs(deconvolve.convolve_pulse(profile, GAUSS) - signal).sum() for profile in (fast, plain))
     assert misfit < of_plain
 
 
 def test_every_deconvolution_finds_place_and_amplitude():
     truth = np.zeros((60, 2), np.float32)
     truth[[15, 30], [0, 1]] = 50
-    signal = convolve_pulse(truth, GAUSS)
+    signal = deconvolve.convolve_pulse(truth, GAUSS)
     for profile in (
-        deconvolve_richardson_lucy(signal, GAUSS, np.full(2, 0.5, np.float32), 30),
-        deconvolve_gold(signal, GAUSS, 100),
-        deconvolve_wiener(signal, GAUSS, 1e-4),
+        deconvolve.deconvolve_richardson_lucy(signal, GAUSS, np.full(2, 0.5, np.float32), 30),
+        deconvolve.deconvolve_gold(signal, GAUSS, 100),
+        deconvolve.deconvolve_wiener(signal, GAUSS, 1e-4),
     ):
         assert np.argmax(profile, axis=0).tolist() == [15, 30]
         for column, place in ((0, 15), (1, 30)):
@@ -152,7 +146,7 @@ def test_every_deconvolution_finds_place_and_amplitude():
 def test_wiener_undoes_a_skewed_pulse_where_it_lies():
     truth = np.zeros((80, 1), np.float32)
     truth[40] = 50
-    profile = deconvolve_wiener(convolve_pulse(truth, SKEWED), SKEWED, 1e-3)
+    profile = deconvolve.deconvolve_wiener(deconvolve.convolve_pulse(truth, SKEWED), SKEWED, 1e-3)
     assert np.argmax(profile) == 40
     assert np.sum(np.arange(80) * profile[:, 0]) / profile.sum() == pytest.approx(40, abs=0.3)
 

@@ -2,20 +2,10 @@
 
 from dataclasses import replace
 
+import contract_tools
 import numpy as np
 import pytest
 from commands import refuses
-from contract_tools import (
-    SYSTEMS,
-    assert_same,
-    check_echoes,
-    inputs,
-    make_block,
-    pieces,
-    record,
-    scene_blocks,
-    waveforms,
-)
 from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import PULSE_SIGMA as SIGMA
 
@@ -34,7 +24,7 @@ PROFILES = list_profiles()
 
 
 def call(stage, block, system, given=None):
-    noise, candidates, fitted = given or inputs(block, system)
+    noise, candidates, fitted = given or contract_tools.inputs(block, system)
     arguments = {
         "noise": (block, system),
         "detect": (block, noise, system),
@@ -57,19 +47,19 @@ def check(stage, result, block, system):
         check_noise(result, block, system)
         return
     fitted = stage.kind in ("decompose", "attribute") and stage.name != "decompose.none"
-    check_echoes(result, block, system, fitted)
+    contract_tools.check_echoes(result, block, system, fitted)
     for name in stage.makes:
         assert len(result.attributes[name]) == len(result)
 
 
 @pytest.mark.quick_cases("1-gaussian", "2-noise grows", "2-learned", "9-skewed", "9-short", "64-gaussian")
-@pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
+@pytest.mark.parametrize("system", contract_tools.SYSTEMS.values(), ids=contract_tools.SYSTEMS)
 @pytest.mark.parametrize("s", [1, 2, 9, 64])
 def test_every_stage_keeps_the_contract_on_any_waveforms(s, system):
-    for name, samples in waveforms(s).items():
-        block = make_block(samples)
+    for name, samples in contract_tools.waveforms(s).items():
+        block = contract_tools.make_block(samples)
         before = block.samples.copy()
-        given = inputs(block, system)
+        given = contract_tools.inputs(block, system)
         for stage in STAGES.values():
             try:
                 check(stage, call(stage, block, system, given), block, system)
@@ -83,13 +73,13 @@ def test_every_stage_keeps_the_contract_on_any_waveforms(s, system):
 @pytest.mark.parametrize("s", [1, 2, 5, 40, 150])
 def test_every_chain_keeps_the_contract_after_its_own_survey(s):
     chains = [load_profile(profile) for profile in PROFILES]
-    for name, samples in waveforms(s).items():
-        block = make_block(samples)
+    for name, samples in contract_tools.waveforms(s).items():
+        block = contract_tools.make_block(samples)
         system = surveying.survey_block(block).system
         for chain in chains:
             try:
                 table = chain.run(block, system)
-                check_echoes(table, block, system, fitted=True)
+                contract_tools.check_echoes(table, block, system, fitted=True)
                 assert set(chain.makes) <= set(table.attributes)
             except Exception as error:
                 error.add_note(f"{chain.name} on {name}")
@@ -110,7 +100,7 @@ def test_constant_waveforms_have_no_echo(level):
 @pytest.fixture(scope="module", params=["mixed", "stiff"])
 def scene(request):
     """A block with returns near its echoes, and its survey."""
-    block = scene_blocks()[request.param]
+    block = contract_tools.scene_blocks()[request.param]
     system = surveying.survey_block(block).system
     # A survey of so few clear echoes may not know their skew; some stages need one.
     system = replace(system, skew=system.skew or 0.0)
@@ -128,12 +118,12 @@ def test_chains_give_the_same_bits_for_any_block_size(scene, profile, size, syst
     block, system = scene
     block = block.rows(slice(0, 40 if size == 1 else 110))
     if system_name != "survey":
-        system = SYSTEMS[system_name]
+        system = contract_tools.SYSTEMS[system_name]
     chain = load_profile(profile)
     whole = chain.run(block, system)
-    parts = [(chain.run(block.rows(piece), system), piece.start) for piece in pieces(len(block), size)]
+    parts = [(chain.run(block.rows(piece), system), piece.start) for piece in contract_tools.pieces(len(block), size)]
     assert len(whole) > 20
-    assert_same(EchoTable.concatenate(parts), whole)
+    contract_tools.assert_same(EchoTable.concatenate(parts), whole)
 
 
 @pytest.mark.quick_cases("stiff-7", "mixed-1")
@@ -141,9 +131,9 @@ def test_chains_give_the_same_bits_for_any_block_size(scene, profile, size, syst
 def test_stages_give_the_same_bits_for_any_block_size(scene, size):
     block, system = scene
     block = block.rows(slice(0, 30))
-    cuts = pieces(len(block), size)
-    parts = [(part, inputs(part, system)) for part in (block.rows(cut) for cut in cuts)]
-    given = inputs(block, system)
+    cuts = contract_tools.pieces(len(block), size)
+    parts = [(part, contract_tools.inputs(part, system)) for part in (block.rows(cut) for cut in cuts)]
+    given = contract_tools.inputs(block, system)
     for stage in STAGES.values():
         whole = call(stage, block, system, given)
         results = [call(stage, part, system, part_given) for part, part_given in parts]
@@ -152,7 +142,7 @@ def test_stages_give_the_same_bits_for_any_block_size(scene, size):
         else:
             joined = EchoTable.concatenate(zip(results, (cut.start for cut in cuts), strict=True))
         try:
-            assert_same(joined, whole)
+            contract_tools.assert_same(joined, whole)
         except AssertionError as error:
             error.add_note(stage.name)
             raise
@@ -190,7 +180,7 @@ VARIANTS = [
 
 
 def call_method(name, parameters, block, system):
-    noise, candidates, _ = inputs(block, system)
+    noise, candidates, _ = contract_tools.inputs(block, system)
     given = (candidates,) if name.startswith("decompose") else ()
     return STAGES[name].function(block, noise, system, *given, **parameters)
 
@@ -200,16 +190,16 @@ def call_method(name, parameters, block, system):
 @pytest.mark.parametrize("system", ["gaussian", "learned", "short"])
 @pytest.mark.parametrize("s", [1, 2, 40])
 def test_variants_keep_the_contract_on_any_waveforms(name, parameters, s, system):
-    for samples in waveforms(s).values():
-        block = make_block(samples)
-        table = call_method(name, parameters, block, SYSTEMS[system])
-        check_echoes(table, block, SYSTEMS[system], fitted=name.startswith("decompose"))
+    for samples in contract_tools.waveforms(s).values():
+        block = contract_tools.make_block(samples)
+        table = call_method(name, parameters, block, contract_tools.SYSTEMS[system])
+        contract_tools.check_echoes(table, block, contract_tools.SYSTEMS[system], fitted=name.startswith("decompose"))
 
 
 @pytest.fixture(scope="module")
 def mixed():
     """A block and its survey."""
-    block = scene_blocks()["mixed"].rows(slice(0, 60))
+    block = contract_tools.scene_blocks()["mixed"].rows(slice(0, 60))
     return block, surveying.survey_block(block).system
 
 
@@ -220,9 +210,9 @@ def test_variants_give_the_same_bits_for_any_block_size(mixed, name, parameters)
     whole = call_method(name, parameters, block, system)
     assert len(whole) > 15
     for size in (1, 7):
-        cuts = pieces(len(block), size)
+        cuts = contract_tools.pieces(len(block), size)
         parts = [(call_method(name, parameters, block.rows(cut), system), cut.start) for cut in cuts]
-        assert_same(EchoTable.concatenate(parts), whole)
+        contract_tools.assert_same(EchoTable.concatenate(parts), whole)
 
 
 @pytest.mark.parametrize("name", sorted(name for name in STAGES if name.startswith(("detect.", "decompose."))))
@@ -291,7 +281,7 @@ def test_mixed_fits_only_where_detectors_disagree():
     for w in range(120):
         row = [table.take(np.flatnonzero(table.waveform == w)) for table in (mixed, quick, fitted)]
         source = 1 if np.array_equal(row[0].time, row[1].time) else 2
-        assert_same(row[0], row[source])
+        contract_tools.assert_same(row[0], row[source])
         taken[source - 1] += 1
     assert taken.min() > 30
     refuses(ConfigError, "decompose.none", parse_chain, chain_text("asdf_mixed"), "c")
@@ -336,7 +326,7 @@ def test_basin_of_undamped_steps(off, width, least, most):
 
 
 def test_lost_fits_give_their_start_back_with_a_flag():
-    block, noise = record(1, (100, [30.0]), std=0.0, s=60)
+    block, noise = contract_tools.record(1, (100, [30.0]), std=0.0, s=60)
     start = EchoTable.build(np.zeros(1), np.array([35.0]), np.array([100 * FINE]), np.array([SIGMA]))
     found = STAGES["decompose.gauss_newton"].function(block, noise, SYSTEM, start)
     assert found.time.tolist() == [35.0]
@@ -364,7 +354,7 @@ def test_the_printed_formula_has_the_skew_of_its_origin(origin, low, high):
 
 @pytest.mark.parametrize("name", ["gauss_newton", "log_normal", "asdf_mixed"])
 def test_what_was_fitted_is_drawn(name):
-    block, noise = record(20, (150, np.linspace(30, 31, 20)))
+    block, noise = contract_tools.record(20, (150, np.linspace(30, 31, 20)))
     detector = "detect.asdf" if name == "asdf_mixed" else "detect.maximum"
     given = STAGES[detector].function(block, noise, SYSTEM)
     step = Step(STAGES[f"decompose.{name}"])
