@@ -14,7 +14,7 @@ import click
 from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, format_json, talk, tell
-from wavebatch.files.disk.publish import protecting, refuse_existing, refuse_input
+from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.files.text_file import write_text
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.tools.sheets.sheet import list_lines
@@ -71,13 +71,11 @@ def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **op
 
     if (targets is None) == (options["column"] is None):
         raise click.UsageError("give --targets FILE, or --from-column NAME, and not both")
-    paths = shared.find_inputs(strips, recursive=options["recursive"])
+    paths = shared.find_inputs(strips, options)
     html_file, report, overwrite = options["html_file"], options["report"], options["overwrite"]
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, report, html_file)):
             refuse_input(target)
-    for target in filter(None, (output, report)):
-        refuse_existing(target, overwrite)
     shared.check_html(html_file)
     asked = shared.from_options(RunOptions, options)
     chain, request = find_request(asked)  # pulse and chain are chosen as `wavebatch run` chooses them

@@ -18,11 +18,10 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete
 from wavebatch.cli.messages import answer, talk, tell
-from wavebatch.cli.plot import choose_points, find_clouds
+from wavebatch.cli.plot import choose_points
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, count
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
 from wavebatch.files.toml_file import describe_record
@@ -43,7 +42,6 @@ _COUNTED = ("by_number", "by_count")
 
 @click.command()
 @shared.clouds_argument
-@shared.declared("recursive")
 @click.option("--area", "size", type=float, metavar="SIZE",
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
 @shared.declared("polygon", "Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the file "
@@ -64,9 +62,7 @@ def stats(clouds: tuple[Path, ...], output: Path | None, **options: Any) -> None
       # return numbers, separations and flags of clouds
       wavebatch stats clouds/*.laz
     """  # fmt: skip
-    files, size, polygon = find_clouds(clouds, options), options["size"], options["polygon"]
-    if output is not None:
-        check_target(output, overwrite=options["overwrite"])
+    files, size, polygon = shared.find_inputs(clouds, options), options["size"], options["polygon"]
     divisions = [] if size is None else [returns.AreaGrid(size)]
     divisions += [] if polygon is None else [returns.PolygonSet(load_polygons(polygon))]
     failed: list[InputError] = []
@@ -165,7 +161,6 @@ FEW_CELLS = 1_000_000
 
 @click.command()
 @shared.clouds_argument
-@shared.declared("recursive")
 @click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete("columns"),
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
 @shared.options_of(GridOptions)
@@ -200,7 +195,7 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     """  # fmt: skip
     from wavebatch.files.geotiff_file import check_raster
 
-    paths = find_clouds(clouds, options)
+    paths = shared.find_inputs(clouds, options)
     check_raster(output, overwrite=options["overwrite"])
     forest = shared.from_options(ForestOptions, options) if options["forest"] else None
     how = shared.from_options(GridOptions, options, columns=columns, selection=choose_points(options), forest=forest)

@@ -112,10 +112,9 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
     if not given:
         return
     read = {name for option in _list_options(context.command).values() for name in option.envvar or ()}
-    names = {one.words.name or name for name, one in OPTIONS.items() if name not in NO_VARIABLE}
-    read |= {f"{PREFIX}{command}{name}".replace("-", "_").upper() for name in names for command in ("", "RUN_")}
-    if read.issuperset(given):  # nearly always, if only `run` reads them: the other commands need not be imported
-        return
+    names = (one.words.name or name for name, one in OPTIONS.items() if name not in NO_VARIABLE)
+    if read.union(*(_list_variables("run", name) for name in names)).issuperset(given):
+        return  # nearly always, if only `run` reads them: the other commands need not be imported
     import difflib
 
     root, commands = context.find_root(), {}
@@ -139,6 +138,11 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
 
 def _list_options(command: click.Command) -> dict[str, click.Option]:
     return {one.name: one for one in command.params if isinstance(one, click.Option)}
+
+
+def _list_variables(title: str, name: str) -> list[str]:
+    """Variables that give an option of a command: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS."""
+    return [re.sub("[- ]", "_", f"{PREFIX}{words}").upper() for words in (f"{title} {name}", name)]
 
 
 def find_setting(ctx: click.Context, option: click.Option | None) -> tuple[str, Any]:
@@ -417,13 +421,9 @@ def dress(command: click.Command, title: str) -> click.Command:
     lines = [line.strip() for line in last.splitlines()]
     dressed.help = text.rstrip()
     dressed.examples = tuple((line, why.removeprefix("# ")) for why, line in zip(lines[::2], lines[1::2], strict=True))
-    # Each option may be given by a variable: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS.
     for option in dressed.params:
         if isinstance(option, click.Option) and option.name not in NO_VARIABLE:
-            words = re.sub("[- ]", "_", f"{title} {_option_name(option)}").upper()
-            general = _option_name(option).replace("-", "_").upper()
-            known = [option.envvar] if isinstance(option.envvar, str) else []
-            option.envvar = [*known, f"{PREFIX}{words}", f"{PREFIX}{general}"]
+            option.envvar = _list_variables(title, _option_name(option))
     return dressed
 
 

@@ -20,7 +20,6 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, talk
 from wavebatch.core.units import count
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.cells import doubt_clouds
 from wavebatch.tools.pairing import Comparison, compare_clouds, compare_truth
@@ -81,8 +80,6 @@ def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **
       wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95
     """  # fmt: skip
     shared.check_html(options["html_file"])
-    if output is not None:
-        check_target(output, overwrite=options["overwrite"])
     result: Matchup | Comparison
     if strip:
         from wavebatch.core.errors import nearest

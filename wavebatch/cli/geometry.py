@@ -20,7 +20,7 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import counting, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import count, format_measure
-from wavebatch.files.disk.publish import refuse_existing, refuse_input
+from wavebatch.files.disk.publish import refuse_input
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.geojson import GEOJSON_CRS, plan_crs
 from wavebatch.files.las.crs import describe_crs, read_crs_definition
@@ -91,11 +91,9 @@ def slice_(strips: tuple[str, ...], output: Path | None, **options: Any) -> None
         raise click.UsageError("give -o for the segments, --png or --overview for a picture, or --cube")
     if options["geojson_crs"] == "keep" and (output is None or output.suffix.lower() != ".geojson"):
         raise click.UsageError("--geojson-crs keep is of no use without -o FILE.geojson: other files keep the CRS")
-    for target in extras:
-        refuse_existing(target, options["overwrite"])
     for picture in filter(None, (options["png"], options["overview"])):
         check_picture(picture, overwrite=options["overwrite"])
-    paths = shared.find_inputs(strips, recursive=options["recursive"])
+    paths = shared.find_inputs(strips, options)
     if extras and len(paths) > 1:
         raise ConfigError(f"{extras[0]}: one file for {len(paths)} strips; make them one by one")
     targets = {} if output is None else shared.name_outputs(paths, output, slice_output.SEGMENT_SUFFIXES, ".csv")
@@ -244,7 +242,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     job = StripJob(Path(), chain, asked, request=request, sensor=read_sensor(asked), calibration=calibration,
                    selection=PointFilter(where=options["where"]))  # fmt: skip
     files = {name: options[name] for name in ("overwrite", "profiles")}
-    paths = shared.find_inputs(strips, recursive=options["recursive"])
+    paths = shared.find_inputs(strips, options)
     if options["profiles"] is not None:
         refuse_input(options["profiles"])
     if len(paths) > 1 and options["profiles"] is not None:

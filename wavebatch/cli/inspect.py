@@ -54,7 +54,7 @@ def info(strips: tuple[str, ...], direction: str, headerless: bool, **options: A
       # points, packets, descriptors and samples
       wavebatch info strip.las
     """
-    paths, lost = shared.find_inputs(strips, recursive=options["recursive"]), 0
+    paths, lost = shared.find_inputs(strips, options), 0
 
     def show(path: Path) -> dict[str, Any]:
         facts = describe_file(path, direction=direction, headerless=headerless)
@@ -109,7 +109,7 @@ def check(files: tuple[Path, ...], direction: str, headerless: bool, **options: 
     from wavebatch.surveying.inspect_strip import check_file  # imports all stages
 
     clean, results = True, []
-    for path in shared.find_inputs(files, recursive=options["recursive"]):
+    for path in shared.find_inputs(files, options):
         found = check_file(path, direction=direction, headerless=headerless)
         clean &= found.is_clean and not (options["strict"] and found.notes)
         results.append(found.to_json())

@@ -25,7 +25,7 @@ from wavebatch.cli.command import READ, complete, complete_files, find_setting
 from wavebatch.cli.messages import LEVELS, LOG, answer, begin_log, keep_level, one_line, report_errors, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
-from wavebatch.files.disk.publish import protecting, refuse_input
+from wavebatch.files.disk.publish import check_target, protecting, refuse_input
 from wavebatch.files.text_file import find_files
 
 if TYPE_CHECKING:
@@ -266,10 +266,10 @@ def write_html(target: Path | None, of: str, parts: Iterable[SheetPart]) -> None
         tell(f"{target}: written")
 
 
-def find_inputs(arguments: Iterable[Path | str], **how: Any) -> list[Path]:
+def find_inputs(arguments: Iterable[Path | str], options: Mapping[str, Any], **how: Any) -> list[Path]:
     """The files of the arguments, as `find_files` finds them; a link to a file that was given before is named,
-    and so are subfolders that cannot be read."""
-    return find_files(map(str, arguments), note=note_input, **how)
+    and so are subfolders that cannot be read. options: of the command, with --recursive."""
+    return find_files(map(str, arguments), note=note_input, recursive=options["recursive"], **how)
 
 
 def note_input(line: str) -> None:
@@ -287,8 +287,10 @@ strips_argument = together(
     click.argument("strips", nargs=-1, required=True, metavar="STRIP...", shell_complete=complete_files),
     declared("recursive"),
 )
-clouds_argument = click.argument("clouds", nargs=-1, required=True, type=INPUT, metavar="CLOUD...",
-                                shell_complete=complete_files)  # fmt: skip
+clouds_argument = together(
+    click.argument("clouds", nargs=-1, required=True, type=INPUT, metavar="CLOUD...", shell_complete=complete_files),
+    declared("recursive"),
+)
 
 strip_options = together(declared("direction"), declared("headerless"))
 system_option = together(declared("system"), declared("force"))
@@ -320,7 +322,7 @@ def common_options(*names: str, failure: int = 1) -> Callable:
 
     def decorate(command: Callable) -> Callable:
         shared = (*names, "quiet", "log_file", "log_level", "config", "debug")
-        # Outputs never replace inputs, nor each other.
+        # Outputs never replace inputs, nor each other, nor files without --overwrite; pages of --html know their own.
         @functools.wraps(command)
         def call(*args: Any, **options: Any) -> Any:
             context = click.get_current_context()
@@ -331,6 +333,7 @@ def common_options(*names: str, failure: int = 1) -> Callable:
             check_together(given, known, lambda name: max(known[name].opts, key=len) if name in known else typed(name))
             inputs: list[Any] = list(context.meta.get(READ, ()))
             outputs: dict[str, Any] = {}
+            files: list[Path] = []
             if LOG in context.meta:
                 outputs[os.path.realpath(context.meta[LOG])] = [context.meta[LOG]]
             for parameter in context.command.params:
@@ -338,6 +341,7 @@ def common_options(*names: str, failure: int = 1) -> Callable:
                 if isinstance(parameter.type, OutputPath):
                     if value not in (None, "-"):
                         outputs.setdefault(os.path.realpath(value), []).append(value)
+                        files += [] if parameter.type.dir_okay or parameter.name == "html_file" else [value]
                 elif isinstance(parameter.type, click.Path):
                     inputs += value if isinstance(value, tuple) else [value]
             with protecting(inputs):
@@ -345,6 +349,8 @@ def common_options(*names: str, failure: int = 1) -> Callable:
                     refuse_input(same[0])
                     if len(same) > 1:
                         raise ConfigError(f"{same[0]}: two outputs have this name; choose another for one of them")
+                for target in files if "overwrite" in names else ():
+                    check_target(target, overwrite=options["overwrite"])
                 return command(*args, **options)
         return together(*(_COMMON[name] for name in shared))(report_errors(call, failure))
 

@@ -18,20 +18,14 @@ from wavebatch.cli.command import complete
 from wavebatch.cli.messages import NearestGroup, answer, talk, tell
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count
-from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.text_file import SUFFIXES, write_text
 
 output_option = shared.output_option("Picture to write: .png, .svg or .pdf.")
 
 
-def find_clouds(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
-    """The files that the arguments name."""
-    return shared.find_inputs(clouds, recursive=options["recursive"])
-
-
 def draws_clouds(
-    *options_here: Callable, name: str | None = None, find: Callable[..., list[Path]] = find_clouds
+    *options_here: Callable, name: str | None = None, find: Callable[..., list[Path]] = shared.find_inputs
 ) -> Callable[[Callable[..., tuple[str, dict[str, Any]]]], click.Command]:
     """A command that draws clouds: with its options, and those that all such commands share.
 
@@ -54,7 +48,7 @@ def draws_clouds(
             answer({"output": str(output), "clouds": [str(path) for path in paths], **found})
 
         common = shared.selection_options, shared.common_options("overwrite", "json")
-        every = shared.clouds_argument, shared.declared("recursive"), output_option, *options_here, *common
+        every = shared.clouds_argument, output_option, *options_here, *common
         return click.command(name or draw.__name__)(shared.together(*every)(command))
 
     return decorate
@@ -182,7 +176,7 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
     from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, is_segments
 
     kinds = (SUFFIXES, SEGMENT_SUFFIXES) if or_segments else (SUFFIXES,)
-    paths = shared.find_inputs(clouds, recursive=options["recursive"], kinds=kinds)
+    paths = shared.find_inputs(clouds, options, kinds=kinds)
     segments = [path for path in paths if is_segments(path)]
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if segments and not or_segments:
@@ -376,7 +370,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     for key, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
         if options[key]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
-    (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
+    if not tabular:
+        check_picture(output, overwrite=options["overwrite"])
     selection = PointFilter(flags=read_flags(options["flags"]), where=options["where"])
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], selection=selection)
     # The waveforms, and the chain that they are run through.

@@ -41,7 +41,7 @@ EXIT_SOME, EXIT_NONE = 3, 4
                       required=False, folder=None)
 @shared.options_of(ImportOptions)
 @shared.common_options("overwrite", "json")
-def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **options: Any) -> None:
+def import_(files: tuple[str, ...], output: Path | None, **options: Any) -> None:
     """Import PulseWaves FILEs (.pls with the .wvs beside it) as LAS 1.4 strips of point format 9.
 
     FILE is a .pls, a glob, a folder, or @list.txt with one of these per line. A strip has the energy and the height of
@@ -56,7 +56,7 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
       # all files of a folder; go on after an interruption
       wavebatch import archive/ -o strips --resume
     """  # fmt: skip
-    paths = shared.find_inputs(files, recursive=recursive, kinds=(SUFFIXES,))
+    paths = shared.find_inputs(files, options, kinds=(SUFFIXES,))
     if output is None:
         targets = {path: path.with_suffix(".las") for path in paths}
     else:
@@ -96,7 +96,7 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
                       "for each strip.", "FILE|DIR", folder=None)
 @shared.strip_options
 @shared.common_options("overwrite", "json")
-def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: Any) -> None:
+def export(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     """Write STRIPs as other programs need them: LAS with repaired packets, or waveforms as arrays.
 
     \b
@@ -115,7 +115,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
       # waveforms with their geometry as arrays
       wavebatch export strip.las -o strip.npz
     """  # fmt: skip
-    paths = shared.find_inputs(strips, recursive=recursive)
+    paths = shared.find_inputs(strips, options)
     targets = shared.name_outputs(paths, output, WRITTEN, ".las")
 
     def work(path: Path) -> ExportSummary:

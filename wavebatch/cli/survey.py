@@ -17,7 +17,6 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, one_line, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import count
-from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.sheets.sheet import Sheet
 
@@ -70,16 +69,14 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
     from wavebatch.tools.sheets.survey import list_doubts, survey_page, survey_sheet
 
     angles, html_file, overwrite = options["angles"], options["html_file"], options["overwrite"]
-    paths = shared.find_inputs(strips, recursive=options["recursive"])
-    for target in (output, chain_file):
-        if target is not None:
-            check_target(target, overwrite=overwrite)
+    paths = shared.find_inputs(strips, options)
     shared.check_html(html_file)
     if angles is not None:
         if len(paths) > 1:
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
-        (check_target if angles.suffix.lower() == ".csv" else check_picture)(angles, overwrite=overwrite)
+        if angles.suffix.lower() != ".csv":
+            check_picture(angles, overwrite=overwrite)
     keeps = bool(output or html_file or options["as_json"])
     saved, facts = _survey(paths[0], options, keeps=keeps) if len(paths) == 1 else _survey_together(paths, options)
     survey = saved.survey

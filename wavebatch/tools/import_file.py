@@ -61,10 +61,6 @@ class ImportOptions:
     overwrite: bool = False
     resume: bool = option(False, "Skip files whose strip is there and up to date.")
 
-    def describe(self) -> dict[str, Any]:
-        """Return what changes the strip."""
-        return {"internal": self.internal, "returns": self.returns}
-
 
 @dataclass(slots=True)
 class ImportSummary:
@@ -123,7 +119,8 @@ def import_file(
     """
     header = pulsewaves_file.read_pulse_header(path)
     source = {"file": path.name, **take_fingerprint(path, header.waves)}
-    account = {"import": source, "options": options.describe(), "version": __version__}
+    changes = {"internal": options.internal, "returns": options.returns}
+    account = {"import": source, "options": changes, "version": __version__}
     # Of this import, of another import or none, or another file.
     state = "mine"
     if target.exists():
