@@ -205,6 +205,12 @@ def test_riegl_is_what_is_known_of_it(riegl):
     assert tried["riegl-q680i"] < min(misfits.gaussian_nats or np.inf, tried["one echo per cluster"] + 1.0)
 
 
+def test_a_known_pulse_far_from_the_strip_is_not_judged_on_all_waveforms():
+    """It took five times as long as the strip's own: three of them were a seventh of the survey of a scene."""
+    survey = survey_block(make_block("mixed", 2000, seed=2)[0])  # 48 waveforms are just not enough
+    assert {one.name for one in survey.candidates} == {"gaussian", "gaussian of all echoes"}
+
+
 @pytest.mark.slow
 def test_leica_is_what_is_known_of_it(leica):
     """A strong skew, which the skewed pulse halves and a learned one brings near the noise."""

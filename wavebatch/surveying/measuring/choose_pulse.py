@@ -247,7 +247,8 @@ def choose_pulse(
     if jointly and min((_save(jointly, one) for one in stacked), default=np.inf) <= LEAST_OF_KNOWN:
         looked.remove(jointly)
     leader = min(looked, key=lambda one: one.typical)
-    hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
+    ahead = {one.name: one.exceeds(leader) for one in looked}
+    hopeful = [one for one in looked if ahead[one.name] < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     # All echoes teach no other pulse than many alone in their waveforms do, with the same freedom.
     gaussian = not (begin.system.components or begin.system.kappa)
@@ -258,8 +259,17 @@ def choose_pulse(
     # Where too few echoes teach further, what lone echoes teach jointly stands for itself.
     tried = {one.name: one.system for one in hopeful if one.name != JOINTLY or not learned}
     tried |= {OF_ALL: own} if plain else {}
-    found = [_judge(judged, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    found = _try_changes(judged, found + learned)
+    found = list(learned)
+    for name, system in tried.items():
+        best, longer = min(found, key=lambda one: one.typical, default=None), ahead.get(name, 0.0)
+        # One that is far from the strip's takes five times as long: first the waveforms that would show it as hopeless.
+        some = spread_rows(len(judged), int(FEWEST * ((HOPELESS + 1) / max(longer, 1.0)) ** 2))
+        if best and name in given and 2 * len(some) < len(judged):
+            length = _judge(judged.rows(some), name, system, CHANGES[1], known=True).length
+            if exceed(length, best.length[some]) >= HOPELESS:
+                continue
+        found.append(_judge(judged, name, system, CHANGES[1], known=name in given))
+    found = _try_changes(judged, found[len(learned) :] + learned)
     choice = _decide(found, small=small)
     if choice.best.name in starts and not _is_as_wide(choice.best, begin):
         # Few waveforms showed another start: what was learned from it may be of another pulse.
