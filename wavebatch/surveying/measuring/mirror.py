@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import distinct
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
@@ -110,29 +111,32 @@ def look_in_mirror(
         alone[match_echoes(other, echoes, SAME * width).found] = False
         rest = other.take(np.flatnonzero(alone))
         energy = rest.amplitude * np.sqrt(rest.sigma) * unit
-        beside, quiet = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
-        down = energy[quiet]
+        near, far = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
+        down, up = energy[far], None
         # Only where it decides: the waveforms are decomposed once more.
         many = len(down) > FALSE_QUIET * len(echoes)
         if many or system.noise.quiet < FINE:
             own = find_echoes(block, system, detect, **options)[2]
-            up = own.amplitude * np.sqrt(own.sigma) * unit
-            if many:
-                # Noise makes no more than there are of that size, within a factor of two: what only goes down makes
-                # none, as tails of echoes of 10,000 noises, far from them.
-                down, octaves = np.sort(down), np.sort(np.frexp(up)[1])
-                octave = np.frexp(down)[1]
-                number = np.searchsorted(octaves, octave, "right") - np.searchsorted(octaves, octave)
-                down = down[np.arange(len(down)) - np.searchsorted(octave, octave) < number]
+            found = own.amplitude * np.sqrt(own.sigma) * unit
+            up = found if many else None
             if system.noise.quiet < FINE:
                 low = own.amplitude < STEP
-                steps.append((up[low], up[~low & (own.amplitude < 2 * STEP)]))
-        false.append((energy[beside], down))
+                steps.append((found[low], found[~low & (own.amplitude < 2 * STEP)]))
+        false.append((energy[near], down, up))
     energy = echoes.amplitude * np.sqrt(echoes.sigma) * unit
     for level in levels:
-        most = [max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True)]
-        made = max(int(np.count_nonzero(low >= level) - np.count_nonzero(high >= level)) for low, high in steps)
-        yield level, Mirror(len(mains), most[0], int(np.count_nonzero(energy >= level)), max(most[1], made))
+        quiet = max(int(np.count_nonzero(low >= level) - np.count_nonzero(high >= level)) for low, high in steps)
+        for _, down, up in false:
+            number = int(np.count_nonzero(down >= level))
+            if up is not None:
+                # Noise makes no more than there are of that size, within a factor of two and an error: what only goes
+                # down makes none, as tails of echoes of 10,000 noises, far from them.
+                lower, upper = (np.frexp(one[one >= level] / (level or 1.0))[1] for one in (down, up))
+                pairs = [[np.count_nonzero(one == octave) for one in (lower, upper)] for octave in distinct(lower)]
+                number = int(sum(min(below, above + above**0.5) for below, above in pairs))
+            quiet = max(quiet, number)
+        beside = max(int(np.count_nonzero(one >= level)) for one, _, _ in false)
+        yield level, Mirror(len(mains), beside, int(np.count_nonzero(energy >= level)), quiet)
 
 
 def count_holes(system: SystemPulse, explained: Explained, spacing: float) -> int:
