@@ -19,7 +19,6 @@ from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, find_rays, fit_rays, group_times, number_returns
 from wavebatch.kernels.geometry.normals import thin_out
 from wavebatch.kernels.geometry.ray_convergence import fit_best, fit_sensor, range_error, sensor_at
-from wavebatch.kernels.geometry.slice_lines import find_lines
 from wavebatch.kernels.physics import incidence
 from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
 from wavebatch.kernels.physics.radiometry import judge_energies
@@ -466,33 +465,6 @@ def test_dense_points_are_thinned_as_by_a_loop(rng):
     expected = naive_geometry.thin_out(xyz, row, 2.0, normals.FINENESS, normals.MOST_PER_CELL)
     np.testing.assert_array_equal(kept, expected)
     assert 0.1 < kept.mean() < 0.9
-
-
-def slice_of(rng, kind):
-    """Pixels (x, y), weights of one or two lines among scattered pixels."""
-    along = rng.uniform(0, 60, 70)
-    x, y = along, {"flat": 0.1, "steep": 3.0}.get(kind, -0.7) * along + rng.normal(0, 1.0, 70)
-    if kind == "crossing":
-        y[::3] = 0.7 * along[::3] - 40
-    if kind == "gaps":
-        x[::2] += 90
-    noise = rng.uniform(-10, 80, (2, 25 if kind != "noise" else 200))
-    if kind == "noise":
-        x = y = np.empty(0)
-    return np.r_[x, noise[0]], np.r_[y, noise[1]], rng.uniform(0.5, 3.0, len(x) + noise.shape[1])
-
-
-@pytest.mark.parametrize("kind", ["flat", "steep", "crossing", "gaps", "noise"])
-def test_lines_of_a_slice_are_those_of_loops(rng, kind):
-    x, y, weight = slice_of(rng, kind)
-    options = {"sigma": 1.0, "gap": 12.0, "shortest": 15.0, "most": 3}
-    lines = find_lines(x, y, weight, **options)
-    expected = naive_geometry.find_lines(x, y, weight, **options)
-    assert len(lines) == len(expected) and (lines or kind == "noise")
-    for line, (rows, start, end, total) in zip(lines, expected, strict=True):
-        assert line.rows.tolist() == rows
-        assert line.start == pytest.approx(start, abs=1e-6) and line.end == pytest.approx(end, abs=1e-6)
-        assert line.weight == pytest.approx(total)
 
 
 @pytest.mark.parametrize("threshold", [2.0, 4.0])

@@ -44,7 +44,6 @@ COMPILED = {
 """Function of the library, the kernel that calls it, and the twin that a test compares that with."""
 
 HARD = {
-    "find_lines": "naive_geometry.find_lines",
     "fit_sensor": "naive_geometry.fit_sensor", "find_rays": "naive_geometry.find_rays",
     "match_returns": "naive.match_returns",
     "cross_voxels": "test_voxel_kernels.walk", "angles_above": "naive_physics.angle_above",
