@@ -17,6 +17,7 @@ from strips import write_positions
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.las.header import ExtraRecord
 from wavebatch.files.strip.packets import FullwaveWriter
+from wavebatch.tools.simulate.returns import fill_packets
 
 C_AIR = 0.299792458 * 0.9997 / 2
 """One-way metres per two-way ns."""
@@ -268,7 +269,6 @@ def write_pulses(path, sensor, stored, seconds, channel, samples, energy) -> Non
         points = np.zeros(len(channel), writer.dtype)
         for axis, name in enumerate("XYZ"):
             points[name] = np.rint((origin + hit[:, None] * ray)[:, axis] / 0.001)
-            points["xyz"[axis] + "_t"] = -ray[:, axis] * C_AIR / 1000.0
         points["gps_time"] = sensor.time + seconds
         if sensor.store_energy:
             points[sensor.energy_column] = energy
@@ -285,9 +285,7 @@ def write_pulses(path, sensor, stored, seconds, channel, samples, energy) -> Non
             points["classification_flags"] = (channel - 1) << 4
         else:
             points["scan_angle_rank"] = np.rint(across)
-        points["wavepacket_index"] = used
-        points["wavepacket_offset"] = offset
-        points["wavepacket_size"] = sensor.n_samples * samples.dtype.itemsize
-        points["return_point_wave_location"] = (hit / C_AIR - first) * 1000.0
+        size, time = sensor.n_samples * samples.dtype.itemsize, hit / C_AIR - first
+        fill_packets(points, used, offset, size, time, ray * C_AIR)
         writer.write_points(points)
         writer.commit()

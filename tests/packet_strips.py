@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.strip.packets import FullwaveWriter
+from wavebatch.tools.simulate.returns import fill_packets
 
 SIGMA = 2.0
 LENGTHS = np.arange(32, 513, 32)
@@ -73,21 +74,16 @@ def write_recorded(path, counts, begin, xy, echoes, packets=None, *, time=None, 
             for one in at[inside] if inside.any() else [first + length / 2]:
                 rows.append((pulse, one, one - first, known, offset[i], length * 2))
         points = np.zeros(len(rows), writer.dtype)
-        pulse = np.array([row[0] for row in rows])
-        at = np.array([row[1] for row in rows])
+        pulse, at = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
         place = np.column_stack([xy, begin])[pulse] + direction[pulse] * at[:, None]
         for axis, name in enumerate("XYZ"):
             points[name] = np.rint(place[:, axis] / 0.001)
-        for axis, name in enumerate(("x_t", "y_t", "z_t")):
-            points[name] = -direction[pulse, axis] / 1000.0
         points["bit_fields"] = 9 if scanner is None else 17
         if scanner is not None:
             points["classification_flags"] = np.asarray(scanner)[pulse] << 4
         points["gps_time"] = (1000.0 + np.arange(n) * 1e-5 if time is None else time)[pulse]
-        points["return_point_wave_location"] = [row[2] * 1000.0 for row in rows]
-        points["wavepacket_index"] = [row[3] for row in rows]
-        points["wavepacket_offset"] = [row[4] if row[3] else 0 for row in rows]
-        points["wavepacket_size"] = [row[5] if row[3] else 0 for row in rows]
+        after, index, place, size = np.array([row[2:] for row in rows]).T
+        fill_packets(points, index, place, size, after, direction[pulse])
         writer.write_points(points if order is None else points[order(len(points), pulse)])
         writer.commit()
     return path

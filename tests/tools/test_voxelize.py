@@ -27,6 +27,7 @@ from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.systems.survey_result import SavedSurvey
 from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.render import FlightLine, Recording, find_pulse
+from wavebatch.tools.simulate.returns import fill_packets
 from wavebatch.tools.simulate.scenes import simulate_block
 from wavebatch.tools.simulate.strip import WKT, StripOptions
 from wavebatch.tools.voxels import rays
@@ -73,14 +74,10 @@ def write_strip(path, echoes, *, sigma=2.0, height=110.0, directions=None, xy=No
         place = start[row] + directions[row] * table[:, 3:4]
         for axis, name in enumerate("XYZ"):
             rows[name] = np.rint(place[:, axis] / 0.001)
-        for axis, name in enumerate(("x_t", "y_t", "z_t")):
-            rows[name] = -directions[row, axis] / 1000.0
         shift = 4 if point_format > 5 else 3
         rows["bit_fields"] = table[:, 1].astype(int) | (table[:, 2].astype(int) << shift)
         rows["gps_time"] = 1000.0 + row * 1e-5
-        rows["wavepacket_index"], rows["wavepacket_offset"] = 1, offset[row]
-        rows["wavepacket_size"] = s * bits // 8
-        rows["return_point_wave_location"] = table[:, 4] * 1000.0
+        fill_packets(rows, np.ones(len(row)), offset[row], s * bits // 8, table[:, 4], directions[row])
         writer.write_points(rows)
         writer.commit()
     return path
