@@ -84,12 +84,7 @@ def stats(clouds: tuple[Path, ...], output: Path | None, **options: Any) -> None
         rows = [_table_row(cloud, part, *most) for cloud, part in parts]
         write_text(output, format_csv(list(rows[0]), (row.values() for row in rows)), overwrite=options["overwrite"])
     shown = [*each, total] if len(files) > 1 else each
-    *plain, whole = [
-        {**asdict(one), "returns_per_pulse": one.returns_per_pulse,
-         "areas": [{**asdict(area), "returns_per_pulse": area.returns_per_pulse} for area in one.areas]}
-        for one in (*each, total)
-    ]  # fmt: skip
-    document = {"files": plain, "total": whole}
+    document = {"files": list(map(asdict, each)), "total": asdict(total)}
     sheets = [_sheet(one) for one in shown]
     answer(document, Sheet("stats", [*sheets[0].parts, *sheets[1:]]) if sheets else None)
     sys.exit(EXIT_UNREADABLE if failed else 0)

@@ -232,10 +232,8 @@ def match_sides(
                 sides = [found["a"].rows(), found["a"].vendor_rows()]
                 if "b" in found:
                     sides = [one.rows_along() for one in found.values()]
-                # All waveforms of the block, so that those without an echo count too.
-                keys = np.zeros(len(block), pairing.PACKET_DTYPE)
-                keys["gps_time"] = np.arange(len(block))
-                pairs.pair_by_time(*sides, keys)
+                keys = np.arange(len(block), dtype=np.float64)  # all waveforms: those without an echo count too
+                pairs.pair_by_time(*sides, keys.view(pairing.PACKET_DTYPE))
             between = pairs.finish(a.name, b.name if b else str(strip), "waveform")
     some = next(iter(runs.values())).vendor
     vendor = {key: run.vendor.finish(chains[key].name, str(strip), "waveform") for key, run in runs.items()}
@@ -312,10 +310,8 @@ class ChainRun:
         number = found.echoes.count(len(block))
         misfit, floor = measure_fit(found.block, found.noise, found.system, self.chain.decomposer, found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
-        # All waveforms of the block, so that those without an echo count too.
-        keys = np.zeros(len(block), pairing.PACKET_DTYPE)
-        keys["gps_time"] = np.arange(len(block))
-        self.vendor.pair_by_time(found.rows(), found.vendor_rows(), keys)
+        keys = np.arange(len(block), dtype=np.float64)  # all waveforms, so that those without an echo count too
+        self.vendor.pair_by_time(found.rows(), found.vendor_rows(), keys.view(pairing.PACKET_DTYPE))
 
 
 def _rank(waveform: np.ndarray, time: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -150,6 +150,8 @@ class PulseStats:
 
     points: int
     pulses: int
+    returns_per_pulse: float
+    """Mean number of returns; NaN without pulses."""
     by_number: dict[int, float]
     """Share of the returns with this return number."""
     by_count: dict[int, float]
@@ -162,11 +164,6 @@ class PulseStats:
     depth: Annotated[float, Key("first_above_last_m")]
     """Mean height of the first above the last return of these pulses [m]: how deep they reach into the vegetation; NaN
     without any."""
-
-    @property
-    def returns_per_pulse(self) -> float:
-        """Mean number of returns; NaN without pulses."""
-        return self.points / self.pulses if self.pulses else math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,6 +254,7 @@ class AreaTally:
         for row in order.tolist():
             sums, area = self._sums[row], self.division.describe(int(self._areas[row]))
             several, parts = int(sums["several"]), (sums["pairs"], sums["apart"], sums["least"])
+            points, pulses = int(sums["by_number"].sum()), int(sums["by_count"].sum())
             ranks = zip(self._ranks, *parts, strict=True)
             shares = {}
             for name in ("by_number", "by_count"):  # of the sum, without zeros
@@ -265,8 +263,9 @@ class AreaTally:
             found.append(AreaStats(
                 **area._asdict(),
                 **asdict(describe_pairs(parts[0].sum(), parts[1].sum(), parts[2].min())),
-                points=int(sums["by_number"].sum()),
-                pulses=int(sums["by_count"].sum()),
+                points=points,
+                pulses=pulses,
+                returns_per_pulse=points / pulses if pulses else math.nan,
                 by_number=shares["by_number"],
                 by_count=shares["by_count"],
                 separations={name: describe_pairs(*values) for name, *values in ranks if values[0]},

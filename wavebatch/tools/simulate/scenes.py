@@ -187,11 +187,9 @@ class WithinDepth:
     """Times evenly within a layer `depth` ns deep that lies anywhere in the window."""
 
     depth: float
-    margin: float = 4.0
-    """Distance that echoes keep from the ends of the window, in sigma_ref."""
 
     def __call__(self, rng: np.random.Generator, count: np.ndarray, recording: Recording) -> np.ndarray:
-        low, high = _find_room(recording, self.margin)
+        low, high = _find_room(recording)
         depth = min(self.depth, high - low)
         start = np.repeat(rng.uniform(low, high - depth, len(count)), count)
         return start + depth * rng.random(len(start))
@@ -203,10 +201,9 @@ class WithGaps:
 
     low: float
     high: float
-    margin: float = 4.0
 
     def __call__(self, rng: np.random.Generator, count: np.ndarray, recording: Recording) -> np.ndarray:
-        low, high = _find_room(recording, self.margin)
+        low, high = _find_room(recording)
         most = int(count.max(initial=1)) - 1
         top = min(self.high, (high - low) / max(most, 1)) if most * self.low < high - low else self.low
         # Gaps (n, most), 0 after the last echo. After 32 draws that did not fit, gaps are at most `top`.
@@ -228,9 +225,9 @@ class WithGaps:
         return times[np.arange(most + 1) < np.maximum(count, 0)[:, None]]
 
 
-def _find_room(recording: Recording, margin: float) -> tuple[float, float]:
-    """First and last time at which echoes may lie [ns]."""
-    keep = min(margin * recording.pulse.sigma, recording.duration / 3)
+def _find_room(recording: Recording) -> tuple[float, float]:
+    """First and last time at which echoes may lie [ns]: 4 sigma_ref from the ends of the window."""
+    keep = min(4.0 * recording.pulse.sigma, recording.duration / 3)
     return keep, recording.duration - keep
 
 

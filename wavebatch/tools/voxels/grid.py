@@ -461,16 +461,16 @@ class VoxelFile:
         self._data = read_npz(path, {**needed, **columns}, what, remedy)
         self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
         self.size = float(self._data["size"])
-        lengths = {len(self._data[column.name]) for column in COLUMNS if column.name in self._data}
+        known = {column.name: column for column in COLUMNS if column.name in self._data}
+        values = [self._data[name] for name in known]
+        lengths = set(map(len, values))
         is_sound = self._index.shape[1] == 3 and lengths == {len(self._index)} and self._origin.shape == (3,)
         is_sound &= bool((np.abs(self._origin) < _LARGEST).all()) and 1e-6 <= self.size < _LARGEST
-        values = [self._data[column.name] for column in COLUMNS if column.name in self._data]
         if not is_sound or any((np.abs(one) > _LARGEST**2).any() for one in values):
             raise InputError(f"{path}: holds no {what}: its arrays do not fit; {remedy}")
         with reading_npz(path, what, remedy):
             json.loads(str(self._data["meta"]))
         self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
-        known = {column.name: column for column in COLUMNS if column.name in self._data}
         if column is not None and column not in known:
             raise ConfigError(f"{path}: has no column {column!r}; {nearest(column, known)}")
         drawn = known.get(column)
