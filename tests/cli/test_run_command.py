@@ -8,7 +8,7 @@ import sys
 
 import pytest
 from batch_tools import read_cloud
-from commands import fail, run_command
+from commands import fail, run_command, succeed
 from commands import run_command as run
 
 from wavebatch.cli import COMMANDS
@@ -60,14 +60,12 @@ def test_dry_run_says_what_would_be_done_and_touches_nothing(tiny_strip, tmp_pat
 
 
 def test_report_of_the_batch_to_a_file_and_to_stdout(tiny_strip, tmp_path):
-    result = _run(tiny_strip, "-o", tmp_path / "a", "--report", tmp_path / "batch.json", "--profile", "fast")
-    assert result.exit_code == 0
+    succeed("run", tiny_strip, "-o", tmp_path / "a", "--report", tmp_path / "batch.json", "--profile", "fast")
     document = json.loads((tmp_path / "batch.json").read_text())
     assert document["schema"] == "wavebatch.batch-report/1"
     assert [strip["status"] for strip in document["strips"]] == ["written"]
-    again = _run(tiny_strip, "-o", tmp_path / "a", "--report", "-", "--profile", "fast", "--resume", "-q")
+    again = succeed("run", tiny_strip, "-o", tmp_path / "a", "--report", "-", "--profile", "fast", "--resume", "-q")
     printed = json.loads(again.stdout)
-    assert again.exit_code == 0
     assert printed["counts"] == document["counts"] and printed["strips"][0]["status"] == "skipped"
 
 
@@ -124,8 +122,7 @@ def test_options_reach_the_cloud(tiny_strip, tmp_path):
 def test_the_wrong_direction_puts_echoes_elsewhere(tiny_strip, tmp_path):
     warned = {}
     for sign in ("toward", "away"):
-        result = _run(tiny_strip, "-o", tmp_path / sign, "--direction", sign, "--profile", "fast")
-        assert result.exit_code == 0
+        result = succeed("run", tiny_strip, "-o", tmp_path / sign, "--direction", sign, "--profile", "fast")
         warned[sign] = [line for line in result.stderr.splitlines() if ": warning: " in line]
     assert warned["toward"] == []
     (line,) = warned["away"]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
+from commands import succeed
 
 import wavebatch as wb
 from tests.facet_strips import FARMLAND, START, Facet, Sensor, compare_fields, write_field, write_strip
@@ -39,16 +40,14 @@ def flickering(tmp_path_factory):
     write_strip(folder / "a.las", FARMLAND, FLICKERS, 8000, seed=1)
     write_field(folder / "t.csv")
     for name, more in (("with", ()), ("without", ("--energy", "none"))):
-        done = call("calibrate", folder / "a.las", "--targets", folder / "t.csv", "-o", folder / f"{name}.toml",
-                    "--divergence", 0.4, *more)  # fmt: skip
-        assert done.exit_code == 0, done.output
+        succeed("calibrate", folder / "a.las", "--targets", folder / "t.csv", "-o", folder / f"{name}.toml",
+                "--divergence", 0.4, *more)  # fmt: skip
     return folder
 
 
 def judge(out, strip, calibration, *options):
     """Reflectances of level ground over the truth, less 1, the relative errors that they state, and what was said."""
-    done = call("run", strip, "-o", out, "--calibration", calibration, "--columns", COLUMNS, *options)
-    assert done.exit_code == 0, done.output
+    done = succeed("run", strip, "-o", out, "--calibration", calibration, "--columns", COLUMNS, *options)
     cloud = wb.read_cloud(out / f"{strip.stem}.laz")
     off, inside = compare_fields(cloud, cloud["level_reflectance"])
     stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
@@ -291,9 +290,8 @@ def test_calibrate_takes_the_pulses_that_a_condition_chooses(tmp_path, flickerin
 def test_strips_of_a_flight_are_calibrated_with_one_unit_of_energy(tmp_path, flickering):
     b = replace(FLICKERS, gains={1: 0.8}, start=(98, 100), heading=270.0, time=START + 600)
     write_strip(tmp_path / "b.las", FARMLAND, b, 8000, seed=12)
-    done = call("calibrate", flickering / "a.las", tmp_path / "b.las", "--targets", flickering / "t.csv",
-                "-o", tmp_path / "cal.toml")  # fmt: skip
-    assert done.exit_code == 0, done.output
+    succeed("calibrate", flickering / "a.las", tmp_path / "b.las", "--targets", flickering / "t.csv",
+            "-o", tmp_path / "cal.toml")  # fmt: skip
     found = load_calibration(tmp_path / "cal.toml")
     assert len(found.strips) == 2 and max(abs(row.drift) for row in found.strips) < 0.01
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import kept_surveys
 import pytest
 from batch_tools import read_cloud
-from commands import fail, run_command
+from commands import fail, run_command, succeed
 from helpers_scenes import make_scene
 
 from wavebatch.files.strip.reader import StripReader
@@ -175,8 +175,7 @@ def ringing(tmp_path_factory):
 @pytest.mark.parametrize("saved", [False, True])
 def test_a_chain_that_does_not_fit_the_pulse_is_named_and_its_false_echoes_counted(ringing, tmp_path, options, saved):
     options = [*options, *(["--system", ringing / "SYSTEM.toml"] if saved else [])]
-    result = _run(ringing / "ringing.las", "-o", tmp_path, "-q", *options)
-    assert result.exit_code == 0
+    result = succeed("run", ringing / "ringing.las", "-o", tmp_path, "-q", *options)
     report = _report(tmp_path, "ringing")
     line, ground = result.stderr.splitlines()  # false echoes beside points that are all ground are ground too
     assert [one["code"] for one in report["warnings"]] == ["false-echoes", "ground"] and "added echoes" in ground

@@ -9,7 +9,7 @@ import laspy
 import naive
 import numpy as np
 import pytest
-from commands import refuses, run_command
+from commands import refuses, run_command, succeed
 from writer_tools import number_returns, write_points
 
 from wavebatch.cli.compare import HEAD, list_rows
@@ -383,8 +383,7 @@ def read(path):
 
 def test_rows_are_the_figures_of_the_document(tmp_path, tiny_strip):
     target = tmp_path / "t.csv"
-    result = run("fast", "balanced", "--strip", tiny_strip, "--limit", 200, "-o", target, "--json")
-    assert result.exit_code == 0, result.output
+    result = succeed("compare", "fast", "balanced", "--strip", tiny_strip, "--limit", 200, "-o", target, "--json")
     found, document = read(target), json.loads(result.stdout)
     between = document
     assert float(found["all", "", "", "", "completeness"]) == pytest.approx(between["completeness"])

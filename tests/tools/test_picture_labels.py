@@ -92,8 +92,7 @@ def test_histograms_maps_sections_and_profiles(texts, tmp_path):
         ["section", cloud, "--column", "amplitude"], ["section", cloud, "--aspect", "5"],
         ["profile", cloud], ["profile", cloud, marked, "--each"], ["profile", cloud, "--column", "amplitude"],
     )):  # fmt: skip
-        result = run_plot(*words, "-o", tmp_path / f"{number}-{words[0]}.png")
-        assert result.exit_code == 0, result.output
+        succeed("plot", *words, "-o", tmp_path / f"{number}-{words[0]}.png")
     check(texts)
 
 

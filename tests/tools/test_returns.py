@@ -139,8 +139,7 @@ def test_a_cloud_that_cannot_be_read_is_named_and_the_others_are_counted(tmp_pat
 
 def test_text_has_every_figure(tmp_path):
     path = write_cloud(tmp_path / "c.las", **SMALL, flags=[EchoFlag.WEAK] * 7)
-    result = CliRunner().invoke(stats, [str(path)])
-    assert result.exit_code == 0
+    result = succeed("stats", path)
     wanted = ("pulses            4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning           incomplete: 1 of 4")
     for text in wanted:
         assert text in result.stdout
