@@ -21,7 +21,7 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, matched_gaus
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Range
-from wavebatch.stages.decompose.merge import OVERLAP, TWINS, UNRESOLVED, cover_hidden
+from wavebatch.stages.decompose.merge import OVERLAP, TWINS, UNRESOLVED, cover_hidden, cover_phases
 from wavebatch.stages.detect.direct import choose_smoothing, samples_of
 from wavebatch.stages.flags import flagging, leave_beside, levels_of, scale_errors, unexplained, unproven
 from wavebatch.stages.pulse_tables import (
@@ -280,7 +280,7 @@ def fit_candidates(
         share = np.where(proven, table.amplitude / (PROVEN * table.amplitude_err), 1.0)
         table = scale_errors(table, np.minimum(share, 1.0))
     # Last: neighbours that were not found say nothing about whether an echo is there.
-    return cover_hidden(table, system, len(block)) if settings.grow else table
+    return cover_phases(cover_hidden(table, system, len(block)), system, block.spacing) if settings.grow else table
 
 
 PROVEN = 2.0
