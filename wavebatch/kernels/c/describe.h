@@ -383,11 +383,19 @@ EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *del
                 const float share = (1 - counted) * multiply(vectors, row, move);
                 for (int64_t v = 0; v < vectors; v++) row[v] -= move[v] * share;
             }
-            for (int64_t c = 0; c <= r && c <= number; c++) {
-                const int64_t from = low[c] > low[r] ? low[c] : low[r], to = high[c] < high[r] ? high[c] : high[r];
-                const double product = multiply(to - from, row + from, d.rows + c * vectors + from);
-                if (r <= number) matrix[r * (number + 1) + c] += product;
-                else right[c] += product;
+            for (int64_t c = 0, some; c <= r && c <= number; c += some) {
+                /* Four at a time: to wait for each addition of a sum takes longer than to make it. */
+                lanes sum[4] = {{0}};
+                int64_t from = vectors, to = 0;
+                for (some = 0; some < 4 && c + some <= r && c + some <= number; some++) {
+                    from = low[c + some] < from ? low[c + some] : from;
+                    to = high[c + some] > to ? high[c + some] : to;
+                }
+                from = low[r] > from ? low[r] : from; to = high[r] < to ? high[r] : to;
+                for (int64_t v = from; v < to; v++)
+                    for (int64_t q = 0; q < 4; q++) sum[q] += row[v] * d.rows[(c + q) * vectors + v];
+                const lanes product = sum_four(sum[0], sum[1], sum[2], sum[3]);
+                for (int64_t q = 0; q < some; q++) *(r <= number ? matrix + r * (number + 1) + c + q : right + c + q) += product[q];
             }
         }
     }

@@ -47,7 +47,7 @@ static void filter_waveform(int64_t s, const float *restrict x, const float *tap
 
 /* The same for `rows` of `length` samples in which those of a waveform are `unit` apart: neighbours are weighted first.
    A few samples at a time, so that they stay in the processor's cache for all taps. */
-EXPORT int64_t filter_rows(const float *signal, int64_t rows, int64_t length, int64_t unit, const float *taps, int64_t reach, float *out) {
+INLINE int64_t filter_rows_any(const float *signal, int64_t rows, int64_t length, int64_t unit, const float *taps, int64_t reach, float *out) {
     enum { TOGETHER = 2048 };
     for (int64_t r = 0; r < rows; r++, signal += length, out += length)
         for (int64_t begin = 0; begin < length; begin += TOGETHER) {
@@ -61,6 +61,8 @@ EXPORT int64_t filter_rows(const float *signal, int64_t rows, int64_t length, in
         }
     return 0;
 }
+OFFER(filter_rows, (const float *signal, int64_t rows, int64_t length, int64_t unit, const float *taps, int64_t reach, float *out),
+      (signal, rows, length, unit, taps, reach, out))
 
 /* A waveform above its level, with 0 where no sample was recorded, and the mean of its neighbours for a single one: an
    echo across it is one. Returns whether its counts differ. */

@@ -63,9 +63,8 @@ def render_pulses(shape: PulseShape, n: int, s: int, waveform: np.ndarray, main:
     """
     if (waveform[1:] < waveform[:-1]).any():
         raise ValueError("echoes are not sorted by their waveform")
-    out = np.zeros((n, s), np.float32)
-    empty = np.zeros((n, s), np.float32)
-    sums = Sums(shape, count_echoes(waveform, n), main, empty, empty, np.zeros((n, s), bool))
+    out = np.empty((n, s), np.float32)
+    sums = Sums(shape, count_echoes(waveform, n), main, out, out, np.empty((n, s), bool))  # what is not read
     call("render_pulses", _as_structure(sums, SampleNoise(1.0), 0.0), out)
     return out
 

@@ -80,8 +80,11 @@ def explain(
     used = block.samples < clip_level(block, system)
     if block.missing is not None:
         used &= ~block.missing
-    left = np.where(used, block.samples - noise.level - model, np.float32(0))
-    left[(block.samples <= floor_level(system)) & (left > 0)] = 0  # an undershoot that was cut off is as any model says
+    left = block.samples - noise.level
+    left -= model
+    left[~used] = 0  # `where` takes five times as long
+    if (floor := floor_level(system)) >= 0:
+        left[(block.samples <= floor) & (left > 0)] = 0  # an undershoot that was cut off is as any model says
     return Explained(echoes, Sums(shape, count_echoes(echoes.waveform, n), main, left, model, used))
 
 
