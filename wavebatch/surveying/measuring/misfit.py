@@ -423,9 +423,9 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
         return system
     left, parts = ResidualShares(block, system, strong), {}
     others = ResidualShares(block, system, weaker) if len(weaker) >= ENOUGH_FOR_TAIL else None
-    for half in range(-2 * TAIL_BEFORE, 2 * TAIL_AFTER):
+    for half in (*range(-2 * TAIL_BEFORE, -5), *range(6, 2 * TAIL_AFTER)):
         seen = left.look(half / 2)
-        if abs(half) < 6 or seen.number < ENOUGH_FOR_TAIL:
+        if seen.number < ENOUGH_FOR_TAIL:
             continue
         # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
         scatter = 2 * np.sqrt(seen.spread**2 - left.noise**2)
@@ -495,8 +495,8 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     must = (share < PART) & (least[owner] < share)
     profile = dict(system.tail_misfit)
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
-        near = np.flatnonzero(np.abs(lag - place) <= ROOM)
-        here = near[np.abs(lag[near] - place) <= 1]
+        away = np.abs(lag - place)
+        here, near = np.flatnonzero(away <= 1), np.flatnonzero(away <= ROOM)
         if abs(place) < 3 or np.count_nonzero(must[here]) < REPEATED:
             continue
         highest, beside = np.zeros((2, len(strong)))
@@ -506,20 +506,21 @@ def find_parts(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         level = log(np.maximum(highest, 1e-9))
         likely: list[tuple[float, np.ndarray]] = []
         varying: list[tuple[float, np.ndarray]] = []
-        for middle in distinct(np.round(log(share[here[must[here]]]), 1)):
-            part = float(exp(middle))
+        middles = distinct(np.round(log(share[here[must[here]]]), 1))
+        for middle, part in zip(middles, exp(middles).tolist(), strict=True):
             seen = whole & (least < LESS * part)
             alike = seen & (np.abs(level - middle) < SAME_SHARE)
             with_it = np.count_nonzero(alike)
             if with_it < REPEATED:
                 continue
             without = np.count_nonzero(seen & (highest < LESS * part) & (beside < part / LESS))
+            if with_it < OFTEN * without:  # nearly always
+                continue
             # Higher echoes there are neighbours, and others of them are as high as the part: as many as in equal steps
             # of the logarithm, or as in the next one.
             above = level[seen & (highest > part / LESS)] - middle
             chance = max(len(above) * 2 * SAME_SHARE / -np.log(part / LESS), np.count_nonzero(above < 3 * SAME_SHARE))
-            least_number = max(REPEATED, OFTEN * without, chance + SURE * np.sqrt(chance + 1))
-            if with_it < least_number or len(distinct(tenth[alike])) < PLACES:
+            if with_it < chance + SURE * np.sqrt(chance + 1) or len(distinct(tenth[alike])) < PLACES:
                 continue
             # Of all that may be it: those near one share hardly differ, however far the others reach.
             wide = seen & (np.abs(level - middle) < 3 * SAME_SHARE)
