@@ -15,7 +15,8 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import even_places, robust_std
+from wavebatch.core.order import even_places, known_median, robust_std
+from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.files.pulse_energy import COLUMN, LEAST_KNOWN, LEAST_SHARE, PulseEnergy, find_column, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
@@ -54,6 +55,16 @@ LEAST_APART, SURE_TURNS, ALIKE_TURNS, CYCLES = 0.04, 6.0, 0.7, 4
 of either size: the strongest period counts, so that sound scenes reach 4, rows of plants 5.3, and 12 in one size;
 by how much as in larger cells it does in smaller ones, where ground that swings gradually shows half; and fewest
 periods that show it."""
+
+BESIDE_STEP, LEAST_LINES, SHORT_LINE, MOST_OFF = 3, 16, 16, 0.05
+"""Pulses in the means on both sides of a step of light at one place of all scan lines; fewest lines that show it;
+fewest pulses of a line, in such means; and share of a line by which its middle may be off even time (median)."""
+
+SURE_STEP, OTHER_STEPS, LEAST_STEP, MOST_STEP, PARTS = 4.0, 2.0, 0.08, 0.7, 3
+"""Lasers take turns where the step is larger than the first times its error; than the second times the steps at all
+other places, as of fields along the flight; and between the next two (logarithm): ground that swings within 10 m bends
+by 0.05, and surfaces differ by more than a factor of 2, which two lasers do not. Each of so many parts of the lines
+must show half of it. Of 320 simulated sound strips 2 had one without the first condition, and none of 800 with it."""
 
 PAIR, OF_GROUND, OF_LIGHT = 2, 0.6, 0.5
 """Mean number of pulses in the small cells that show whether a log is that of echoes: two of its values in one cell
@@ -270,7 +281,61 @@ def _find_gains(pulses: np.ndarray) -> tuple[float, float, int]:
         least, most = (choose((slope for _, slope in shown), default=0.0) for choose in (min, max))
         if least > ALIKE_TURNS * most and all(slope > SURE_TURNS * error for error, slope in shown):
             turns = max(turns, (2.0 * least, int(periods[best])))
+        turns = max(turns, _find_steps(number, bright, place))
     return found, *(turns if turns[0] > LEAST_APART else (0.0, 0))
+
+
+def _find_steps(number: np.ndarray, bright: np.ndarray, place: np.ndarray) -> tuple[float, int]:
+    """By how much light (logarithm) steps up and down at the same places of all scan lines, and the pulses of a line; 0
+    where it does not; number: of pulses (n,), in order; place: east and north, f8 (2, n).
+
+    Lasers that take turns two or four times in a line see each place once: no cell of the ground shows them.
+    """
+    m, nothing = BESIDE_STEP, (0.0, 0)
+    time, aside = number - number.mean(), place - place.mean(axis=1, keepdims=True)
+    aside = aside - np.outer(aside @ time / (time @ time), time)
+    across = np.linalg.eigh(aside @ aside.T)[1][:, 1] @ aside
+    middle = number[np.flatnonzero((across[:-1] < 0.0) & (across[1:] >= 0.0))].astype(np.float64)
+    if len(middle) <= LEAST_LINES:
+        return nothing
+    line = np.cumsum(np.append(0.0, np.rint(np.diff(middle) / np.median(np.diff(middle)))))
+    size, start = np.polyfit(line, middle, 1).tolist()
+    if size < SHORT_LINE * m or np.median(np.abs(middle - start - size * line)) > MOST_OFF * size:
+        return nothing
+    # A row for each line; its end goes on in the next one.
+    row, column = (one.astype(np.int64) for one in divmod(number - start, size))
+    n, row = round(size), row - row.min()
+    table = np.full((2, row.max() + 1, n + 4 * m + 3), np.nan)
+    table[:, row, column] = bright, across
+    table[:, :-1, n:] = table[:, 1:, : 4 * m + 3]
+    mean = np.lib.stride_tricks.sliding_window_view(table, m, axis=2).mean(axis=3)
+    far, before, after, beyond = (mean[:, :, at : at + n] for at in (0, m, 2 * m + 1, 3 * m + 1))
+    jump = np.abs(known_median((after - before)[1], 0))
+    # Less what slopes do; and where the mirror turns, pulses in a row lie on other ground.
+    steps = (after - before)[0] - (m + 1) / (2 * m) * (beyond - after + before - far)[0]
+    level = np.where(jump < 2.0 * known_median(jump, 0), known_median(steps, 0), np.nan)
+    level[np.convolve(np.isnan(level), np.ones(4 * m + 1), "same") > 0.5] = np.nan
+    found = nothing
+    for blocks in (2, 4):
+        turn, places = np.arange(blocks)[:, None], np.arange(int(size / blocks))
+        at, sign = np.rint(places + turn * size / blocks).astype(np.int64) % n, (-1.0) ** turn
+        seen = sign * level[at]
+        whole = np.nan_to_num(known_median(seen, 0))
+        alike = np.fmin.reduce(seen * np.sign(whole), axis=0) > 0.5 * np.abs(whole)
+        best = int(np.argmax(np.abs(whole) * alike))
+        own = known_median(np.where(np.isnan(seen[:, best]), np.nan, (sign * steps.T[at[:, best]]).T), 1)
+        own = own[np.isfinite(own)]
+        if len(own) < LEAST_LINES:
+            continue
+        step, scatter = float(np.median(own)), robust_std(own)
+        rest = np.clip(own - step, -BORDER * scatter, BORDER * scatter)
+        error = MEDIAN_ERROR * scatter * (weigh_alike(rest) / len(own)) ** 0.5
+        apart = np.abs(places - best)
+        other = np.abs(whole[np.minimum(apart, size / blocks - apart) > 2 * m + 1]).max()
+        least = min(float(np.median(part)) / step for part in np.array_split(own, PARTS)) if step else 0.0
+        if max(SURE_STEP * error, OTHER_STEPS * other, LEAST_STEP) < abs(step) < MOST_STEP and least > 0.5:
+            found = max(found, (abs(step), round(size)))
+    return found
 
 
 def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[float, str]:
