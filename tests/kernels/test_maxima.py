@@ -30,6 +30,16 @@ def with_gaps(rng, samples):
     return samples._replace(missing=rng.random(samples.counts.shape) < 0.1)
 
 
+def above_level(samples, row):
+    """Counts of a waveform above its level: 0 where they miss, the mean of both neighbours where one alone does."""
+    y, missing = (samples.counts[row] - samples.baseline[row]).astype(np.float32), samples.missing[row]
+    y[missing] = 0
+    for i in range(1, len(y) - 1):
+        if missing[i] and not missing[i - 1] and not missing[i + 1]:
+            y[i] = np.float32(0.5) * (y[i - 1] + y[i + 1])
+    return y
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32, np.float32])
 @pytest.mark.parametrize(("s", "reach", "recovery"), [(40, 3, 0), (60, 0, 0), (33, 4, 12), (1, 2, 0), (2, 0, 5)])
 def test_quiet_levels(rng, kind, s, reach, recovery):
@@ -93,17 +103,12 @@ def naive_matches(y, missing, least, taps, ref):
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 @pytest.mark.parametrize("s", [2, 5, 64])
 def test_maxima_of_a_correlation(rng, kind, s):
-    samples, ref = record(rng, 80, s, kind), 1.7
-    samples = samples._replace(missing=rng.random((80, s)) < 0.1)
+    samples, ref = with_gaps(rng, record(rng, 80, s, kind)), 1.7
     taps = gaussian_taps(ref)
     waveform, time, height, width = find_correlated(samples, 6.0, ref, taps)
     assert (np.diff(waveform) >= 0).all()
     for i in range(80):
-        y, missing = (samples.counts[i] - samples.baseline[i]).astype(np.float32), samples.missing[i]
-        y[missing] = 0
-        for k in range(1, s - 1):
-            if missing[k] and not missing[k - 1] and not missing[k + 1]:
-                y[k] = np.float32(0.5) * (y[k - 1] + y[k + 1])
+        y, missing = above_level(samples, i), samples.missing[i]
         found = list(naive_matches(y, missing, 6.0 * samples.std[i], taps, ref)) if np.ptp(samples.counts[i]) else []
         mine = np.stack([time, height, width], axis=1)[waveform == i]
         assert len(mine) == len(found)
@@ -124,14 +129,7 @@ def naive_clusters(samples, candidates, margin, reach, most, tail):
     """Clusters as (waveform, low, high, first, number), by loops."""
     s, found = samples.counts.shape[1], []
     for row in np.unique(candidates.waveform):
-        y = (samples.counts[row] - samples.baseline[row]).astype(np.float32)
-        if samples.missing is not None:
-            missing = samples.missing[row]
-            y[missing] = 0
-            for i in range(1, s - 1):
-                if missing[i] and not missing[i - 1] and not missing[i + 1]:
-                    y[i] = np.float32(0.5) * (y[i - 1] + y[i + 1])
-        smooth, level = naive.smooth_121(y), 2 * GAIN_121 * samples.std[row]
+        smooth, level = naive.smooth_121(above_level(samples, row)), 2 * GAIN_121 * samples.std[row]
         members = np.flatnonzero(candidates.waveform == row)
         at = [int(np.rint(np.clip(candidates.time[i], 0, s - 1))) for i in members]
         runs = [run[1:] for run in naive.find_runs(smooth[:, None], [level])]

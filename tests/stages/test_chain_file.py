@@ -118,16 +118,6 @@ def test_values_that_only_the_stage_knows_to_be_wrong_are_no_bugs(text, message)
     refuses(ConfigError, message, chain.run, block, SystemPulse(2.0))
 
 
-def test_unreadable_chain_files_are_config_errors(tmp_path):
-    refuses(ConfigError, r"none\.toml: chain file cannot be read", load_chain_file, tmp_path / "none.toml")
-    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
-    refuses(ConfigError, "UTF-8", load_chain_file, tmp_path / "bytes.toml")
-
-
-def test_unknown_profile_names_the_nearest():
-    refuses(ConfigError, "did you mean 'balanced'", load_profile, "balance")
-
-
 def test_choices_are_checked():
     from typing import Literal
 

@@ -62,6 +62,14 @@ def find(block, system):
     return adaptive(block, noise, system, maximum(block, noise, system))
 
 
+def sizes_of_errors(found, truth):
+    """RMS of the errors of times, amplitudes and widths over those stated."""
+    match = match_echoes(found, truth)
+    for name in ("time", "amplitude", "sigma"):
+        off = getattr(found, name)[match.found].astype(float) - getattr(truth, name)[match.truth]
+        yield np.sqrt(np.mean((off / getattr(found, f"{name}_err")[match.found]) ** 2))
+
+
 @pytest.mark.parametrize(("apart", "before"), [(1.6, 0.1), (1.8, 0.8), (2.2, 1.0)])
 def test_close_pairs_are_found_and_their_errors_right(apart, before):
     """In noise with rho .8 nearly all are found; before, errors of those found were twice too large."""
@@ -70,10 +78,7 @@ def test_close_pairs_are_found_and_their_errors_right(apart, before):
     found = find(block, whiten(system_of()))
     assert (found.count(1000) == 2).mean() > 0.98
     pair = found.take((found.count(1000) == 2)[found.waveform])
-    match = match_echoes(pair, truth)
-    for name in ("time", "amplitude", "sigma"):
-        off = getattr(pair, name)[match.found].astype(float) - getattr(truth, name)[match.truth]
-        assert 0.85 < np.sqrt(np.mean((off / getattr(pair, f"{name}_err")[match.found]) ** 2)) < 1.1, name
+    assert all(0.85 < size < 1.1 for size in sizes_of_errors(pair, truth))
 
 
 @pytest.mark.parametrize("rho", [0.5, 0.8])
@@ -82,10 +87,7 @@ def test_errors_of_lone_echoes_are_right(rho):
     found = find(block, whiten(system_of(rho)))
     lone = found.take(found.alone(2000))
     assert len(lone) > 0.99 * 2000
-    match = match_echoes(lone, truth)
-    for name in ("time", "amplitude", "sigma"):
-        off = getattr(lone, name)[match.found].astype(float) - getattr(truth, name)[match.truth]
-        assert 0.93 < np.sqrt(np.mean((off / getattr(lone, f"{name}_err")[match.found]) ** 2)) < 1.07, name
+    assert all(0.93 < size < 1.07 for size in sizes_of_errors(lone, truth))
     assert 0.75 < np.mean(lone.residual.astype(float) ** 2) < 1, "three parameters of some 20 samples"
 
 

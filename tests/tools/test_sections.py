@@ -257,8 +257,6 @@ def test_a_folder_with_clouds_and_tables_gives_the_clouds(cloud, tmp_path):
     _write_segments(tmp_path / "s.csv", [(1, 2), (3, 4)], [1, 2])
     result = run("plot", "profile", tmp_path, "-o", tmp_path / "p.png", "--json", "-q")
     assert json.loads(result.stdout)["clouds"] == [str(cloud)]
-    (tmp_path / "list.txt").write_text("s.csv\n")
-    fail(2, "segments have no side view", "plot", "section", f"@{tmp_path / 'list.txt'}", "-o", tmp_path / "q.png")
 
 
 @pytest.mark.parametrize("many", [40, 3000])
