@@ -21,7 +21,7 @@ INSIDE = {
     ],
     "surveying/measuring": [
         {"noise_and_width"}, {"residuals"},
-        {"misfit", "learn_pulse", "judge", "return_scatter"}, {"joint_pulse", "mirror", "places"},
+        {"tails", "learn_pulse", "judge", "return_scatter"}, {"misfit", "joint_pulse"}, {"mirror"},
         {"choose_pulse", "whitening"},
     ],
     "batch/workers": [

@@ -16,15 +16,8 @@ from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring.learn_pulse import find_clear
-from wavebatch.surveying.measuring.misfit import (
-    cover_fits,
-    find_parts,
-    measure_tail,
-    share_merged,
-    share_repeated,
-    summarize_shares,
-)
-from wavebatch.surveying.measuring.places import share_placed
+from wavebatch.surveying.measuring.misfit import cover_fits, share_merged, share_placed, share_repeated
+from wavebatch.surveying.measuring.tails import find_parts, measure_tail, summarize_shares
 from wavebatch.surveying.systems.known_systems import compare_pulses
 
 

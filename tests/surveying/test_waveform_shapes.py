@@ -15,7 +15,7 @@ from wavebatch.stages.chain import STAGES, load_profile
 from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
-from wavebatch.surveying.measuring import learn_pulse, misfit
+from wavebatch.surveying.measuring import learn_pulse, tails
 from wavebatch.surveying.measuring.choose_pulse import COUNTED, bear
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly, stack_jointly
 from wavebatch.surveying.measuring.judge import explain
@@ -586,10 +586,10 @@ def test_targets_too_weak_to_be_found_are_measured_beside_strong_echoes(height):
 def test_echoes_are_added_to_so_many_samples_only(monkeypatch, samples, turns):
     """Where no place is free; 600 long and full packets took 45 s and 470 MB."""
     seen = []
-    monkeypatch.setattr(misfit, "_add_beside", lambda *given: seen.extend(given[-1]) or [])
+    monkeypatch.setattr(tails, "_add_beside", lambda *given: seen.extend(given[-1]) or [])
     block = WaveformBlock.from_samples(np.full((30, samples), 12, np.uint8))
     echoes = EchoTable.build(np.arange(30), np.full(30, 50.0), np.full(30, 100.0), np.full(30, 2.0))
-    misfit.measure_beside(block, SystemPulse(2.0, noise=ReceiverNoise(12.0, std=1.0)), echoes)
+    tails.measure_beside(block, SystemPulse(2.0, noise=ReceiverNoise(12.0, std=1.0)), echoes)
     assert seen == list(range(turns))
 
 

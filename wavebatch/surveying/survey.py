@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.order import median, quantile
-from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.order import quantile
+from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.toml_file import list_entries
 from wavebatch.kernels.signal.defects import find_seam
@@ -22,25 +23,12 @@ from wavebatch.surveying.measuring.joint_pulse import LEAST_CHANGE
 from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse, measure_skew
 from wavebatch.surveying.measuring.misfit import (
-    LEAST_MISFIT,
     MISFIT_PEAK,
     MOST_FAINT,
-    MOST_LACKED,
-    MOST_MERGED,
-    MOST_MISFIT,
-    MOST_REPEATED,
-    STEP_OF_MISFITS,
-    cover_faint,
-    cover_fits,
-    cover_share,
-    find_parts,
     limit_faint,
-    measure_beside,
-    measure_tail,
+    raise_misfit,
     share_fixed,
-    share_merged,
-    share_repeated,
-    suspect_pairs,
+    share_placed,
 )
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
@@ -50,19 +38,18 @@ from wavebatch.surveying.measuring.noise_and_width import (
     MIN_SNR,
     RESIDUAL_LOOK,
     SMALL,
-    find_single,
-    list_widths,
     measure_again,
     measure_begin,
     measure_gaussian,
     measure_once_more,
     measure_quiet,
+    measure_scatter,
     measure_whole,
     thin_empty,
     thin_samples,
 )
-from wavebatch.surveying.measuring.places import share_placed
 from wavebatch.surveying.measuring.residuals import decompose_again, decompose_sample, guess_growth, measure_residuals
+from wavebatch.surveying.measuring.tails import find_parts, measure_beside, measure_tail
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
@@ -267,17 +254,7 @@ def _survey(
         if len(clear):
             share = MIN_SNR * system.noise.std / quantile(clear.amplitude, 0.99)
             system = replace(system, faint_share=min(max(share, LEAST_CHANGE), MOST_FAINT))
-        starts = {"gaussian": system}
-        if len(main) >= ENOUGH_TO_LEARN:
-            starts |= dict(zip((STACKED, SUMMED), learn_pulse(block, system, clear, main, figures), strict=False))
-        else:
-            guess = guess_width(block, system)
-            starts |= {} if guess is None else {"single echoes": guess}
-            starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
-        # Where a Gaussian misses the lone echoes by less than noise shows, there is nothing to learn but its width.
-        plain = len(block) >= SMALL and figures.misfit_gaussians.get(1, np.inf) <= (figures.misfit_goal or 0.0)
-        if STACKED in starts and not plain:
-            starts[JOINTLY] = learn_alone(block.rows(main.waveform), starts[STACKED])
+        starts, plain = _list_starts(block, system, clear, main, figures)
         known, many = list_known(block, system), len(main) >= SMALL
         choice = choose_pulse(thin_empty(block, system), starts, known, plain=plain, many=many)
         # Starts of guessed widths are measured from nothing, and know no defects.
@@ -319,44 +296,22 @@ def _survey(
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_again(part, system, borne, echoes)
-        # From here on the misfit alone is raised: twice or four times of it as `faint_share` lost echoes of canopies.
-        misfit, left = cover_fits(system, echoes, block.spacing)
-        if misfit > system.misfit:
-            system = replace(system, misfit=misfit)
-            echoes = decompose_sample(part, system)
-        # Neither the description nor what fits leave shows a shape that changes, where two echoes describe it as well.
         most = bear(system, choice.best.change).misfit if choice.best.change else 0.0
-        while system.misfit < most and suspect_pairs(echoes, system.sigma_ref):
-            system = replace(system, misfit=min(max(STEP_OF_MISFITS * system.misfit, LEAST_MISFIT), most))
-            echoes = decompose_sample(part, system)
-        repeated_share = share_repeated(echoes, system.sigma_ref)
-        if repeated_share > MOST_DOUBTED:
-            system, echoes = cover_share(part, system, echoes, share_repeated, MOST_REPEATED, MOST_LACKED)
-        system, echoes = cover_share(part, system, echoes, share_merged, MOST_MERGED, MOST_MISFIT)
-        covered = cover_faint(system, echoes, mirror.beside / max(mirror.echoes, 1))  # of another sample
-        if covered is not system:
-            system, echoes = covered, decompose_sample(part, covered)
+        mirrored = mirror.beside / max(mirror.echoes, 1)  # of another sample
+        system, echoes, doubts = raise_misfit(part, system, echoes, most, mirrored)
         figures.placed_share = share_placed(echoes, system.sigma_ref, len(part))
         fixed_share = share_fixed(echoes, len(part), block.spacing)
         figures.width_in_doubt = choice.spread
         # Neighbours too close to be found stay in the mirror too, but never beside so many of the strong echoes.
         beside = mirror.beside - float(np.sqrt(mirror.beside)) if mirror.beside >= LEAST_HELD else 0.0
         missed = beside / max(mirror.mains, 1)
-        shares = choice.doubt, doubt, left, repeated_share, fixed_share, missed if missed > MOST_DOUBTED else 0.0
+        shares = choice.doubt, doubt, *doubts, fixed_share, missed if missed > MOST_DOUBTED else 0.0
         figures.echoes_in_doubt = min(max(shares), 1.0)
     else:
         part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
-    # Scatter of the widths of clear echoes of one width beyond the errors of their fits [ns]: from those narrower than
-    # the system pulse, since slopes and plants only widen.
-    below, scatter = find_single(echoes, len(part), system) & (echoes.sigma < system.sigma_ref), 0.0
-    if np.count_nonzero(below) >= ENOUGH_TO_LEARN:
-        lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
-        excess = median(lack**2) / SQUARED_NORMAL_MEDIAN - median(echoes.sigma_err[below].astype(np.float64) ** 2)
-        scatter = float(np.sqrt(max(excess, 0.0)))
-    widths = LevelWidths(scatter=scatter)
     system = measure_hidden(part, measure_beside(part, system, echoes), echoes) if errors else system
-    system = replace(system, widths=widths)
+    system = replace(system, widths=LevelWidths(scatter=measure_scatter(part, system, echoes)))
     system = measure_skew(part, system, echoes) if learn else system
     figures = describe_scene(figures, part, system, echoes, MIN_SNR)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
@@ -373,6 +328,30 @@ def _survey(
         reason = f"every strong echo has one of up to {100 * share:.1f} % of it at {lags}: echoes there must be higher"
         decisions = (*decisions, Decision("part of the pulse", True, reason))
     return Survey(system, len(block), figures, decisions, candidates)
+
+
+def _list_starts(
+    block: WaveformBlock, system: SystemPulse, clear: EchoTable, main: EchoTable, figures: Figures
+) -> tuple[dict[str, SystemPulse], bool]:
+    """Pulses that lone echoes teach, by name, and whether a Gaussian is all that they show.
+
+    main: the isolated ones of the clear echoes. Figures get what is left of them.
+    """
+    starts = {"gaussian": system}
+    if len(main) >= ENOUGH_TO_LEARN:
+        starts |= dict(zip((STACKED, SUMMED), learn_pulse(block, system, clear, main, figures), strict=False))
+    else:
+        guess = guess_width(block, system)
+        starts |= {} if guess is None else {"single echoes": guess}
+        # From the narrowest that a sample can show to an eighth of a waveform: a wider pulse leaves no quiet sample.
+        most = max(block.samples.shape[1] / 8, 1.0)
+        widths = [0.75 * 2.0**step for step in range(int(np.log2(most / 0.75)) + 1)]
+        starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in widths}
+    # Where a Gaussian misses the lone echoes by less than noise shows, there is nothing to learn but its width.
+    plain = len(block) >= SMALL and figures.misfit_gaussians.get(1, np.inf) <= (figures.misfit_goal or 0.0)
+    if STACKED in starts and not plain:
+        starts[JOINTLY] = learn_alone(block.rows(main.waveform), starts[STACKED])
+    return starts, plain
 
 
 def _decide(

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.order import find_order, median, quantile
-from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.units import QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
@@ -150,15 +150,6 @@ def measure_whole(block: WaveformBlock, begin: SystemPulse, *, cleaned: bool = F
             break
         begin, cleaned = measure_begin(block, found), False
     return replace(system, sigma_ref=found * block.spacing)
-
-
-def list_widths(block: WaveformBlock) -> list[float]:
-    """Widths of Gaussians to begin with where no echoes stand alone, in steps of 2 [samples].
-
-    From the narrowest that a sample can show to an eighth of a waveform: a wider pulse leaves no sample without signal.
-    """
-    most = max(block.samples.shape[1] / 8, 1.0)
-    return [0.75 * 2.0**step for step in range(int(np.log2(most / 0.75)) + 1)]
 
 
 def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
@@ -428,6 +419,19 @@ def find_single(echoes: EchoTable, n: int, system: SystemPulse, above: float = M
     """Return which echoes are clean, alone in their waveform, of n, and higher than `above` times the noise, bool."""
     strong = echoes.amplitude > above * system.noise.std
     return echoes.alone(n) & strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)
+
+
+def measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
+    """Measure by how much clear echoes of one width scatter beyond the errors of their fits [ns], 0 with too few.
+
+    From those narrower than the system pulse, since slopes and plants only widen. echoes: of the block.
+    """
+    below = find_single(echoes, len(block), system) & (echoes.sigma < system.sigma_ref)
+    if np.count_nonzero(below) < ENOUGH_TO_LEARN:
+        return 0.0
+    lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
+    excess = median(lack**2) / SQUARED_NORMAL_MEDIAN - median(echoes.sigma_err[below].astype(np.float64) ** 2)
+    return float(np.sqrt(max(excess, 0.0)))
 
 
 def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
