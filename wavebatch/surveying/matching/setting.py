@@ -106,6 +106,9 @@ CELLS, LEAST_OF_CELL, LEAST_CELLS = (8, 32), 4, 50
 """Mean numbers of sampled waveforms of the cells in which light is compared with time; fewest of one that counts, and
 fewest such cells."""
 
+SURE_SMOOTH = 2.0
+"""Errors beyond which light that grows along the flight, in cells, shows a landscape that is smooth over the strip."""
+
 BREAK = 10.0
 """Time without a pulse from which another flight line begins [s]: aircraft turn for longer."""
 
@@ -341,7 +344,7 @@ def measure_setting(
         fading.append(_find_fading(time, light, rows[2:4], chance=0.5 * chance))
         lines = _compare_lines(time, np.log(light), rows[2:4], chance=chance)
         fading += [lines] if lines.chance > LIKELY else []
-        sides += [_find_sides(level, across, rows[2:4], chance=chance)] if straight >= LEAST_STRAIGHT else []
+        sides += [_find_sides(level, across, rows[2:4], right, chance=chance)] if straight >= LEAST_STRAIGHT else []
     fades, *uneven = (max(found, key=lambda one: one.error) for found in (fading, *zip(*sides, strict=True)))
     return Setting(rate, brightest, scenes, places, right, fades, zone, straight, tuple(uneven), width)
 
@@ -364,12 +367,25 @@ def _level(rows: np.ndarray, right: tuple[float, float]) -> tuple[np.ndarray, np
     return light, (right[0] * east + right[1] * north) / rows[8]
 
 
-def _find_sides(light: np.ndarray, across: np.ndarray, place: np.ndarray, *, chance: float) -> tuple[Change, ...]:
-    """How light, as from `_level`, grows from one half of the swath to the other, and from its middle to both edges."""
+def _find_sides(
+    light: np.ndarray, across: np.ndarray, place: np.ndarray, right: tuple[float, float], *, chance: float
+) -> tuple[Change, ...]:
+    """How light, as from `_level`, grows from one half of the swath to the other, and from its middle to both edges.
+
+    Landscapes that are smooth over the whole strip grow along the flight as they do across it: what they show there,
+    beyond chance, is in the spread.
+    """
     prior: Any = {"chance": chance / 2, "most": USUAL_SIDES}
-    found = (_find_fading(one, light, place, **prior) for one in (across, np.abs(across)))
-    unseen = weigh_change(0.0, 10.0 * USUAL_SIDES, **prior)  # too few waveforms show nothing
-    return tuple(unseen if one is NO_CHANGE else one for one in found)
+    aside, along = (one * place[0] + other * place[1] for one, other in (right, (-right[1], right[0])))
+    along = along * (float(np.std(across)) / max(float(np.std(aside)), 1e-9))
+    shown = find_growth_in_cells(along, np.log(light), place)
+    smooth, sides = max((abs(slope) - SURE_SMOOTH * error for error, slope in shown), default=0.0), []
+    for one in (across, np.abs(across)):
+        found = _find_fading(one, light, place, **prior)
+        half = 2.0 * float(np.abs(one - one.mean()).mean())
+        spread = float(np.hypot(found.spread, half * max(smooth, 0.0)))  # infinite for too few waveforms
+        sides.append(weigh_change(found.shift, min(spread, 10.0 * USUAL_SIDES), **prior))
+    return tuple(sides)
 
 
 def _find_right(time: np.ndarray, place: np.ndarray) -> tuple[tuple[float, float], float]:
