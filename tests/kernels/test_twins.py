@@ -12,7 +12,7 @@ import pytest
 from scipy.linalg import toeplitz
 
 from wavebatch.kernels.elementary import exp, log, log1p, solve
-from wavebatch.kernels.fit import learn_pulse, pulse_shape
+from wavebatch.kernels.fit import pulse_shape
 from wavebatch.kernels.fit.learn_pulse import Stack, _as_fit, _refine, _sum
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.geometry import normals
@@ -391,18 +391,6 @@ def test_of_several_starts_the_sum_that_misses_least_is_taken(rng):
     found = _refine(stack, weight, starts, 12)
     assert np.argmin(missed) == 1 and missed[1] < 0.1 * np.delete(missed, 1).min()
     np.testing.assert_allclose(found, each[1], atol=1e-6)
-
-
-def test_starts_are_compared_by_means_of_lags_and_the_fit_is_that_of_all(monkeypatch):
-    """Of a drawn pulse, to compare starts in all lags took three quarters of the time of its fit."""
-    lag = np.arange(-12.0, 60.0, 0.14)
-    parts = (1.0, 0.0, 2.0), (0.3, 5.0, 2.5), (0.1, 20.0, 6.0)
-    value = sum(w * np.exp(-0.5 * ((lag - d) / s) ** 2) for w, d, s in parts)
-    stack, sizes = Stack(lag, value, np.full(len(lag), 1e-3)), []
-    monkeypatch.setattr(learn_pulse, "_refine", lambda *given: sizes.append(len(given[1])) or _refine(*given))
-    every = [learn_pulse.fit_gaussians(stack, 2.0, 3, together=number)[-1] for number in (1, 2)]
-    assert every[1].components == pytest.approx(every[0].components, abs=1e-3) and every[1].rms < 1e-4
-    assert sizes[:5] == 5 * [len(lag)] and sizes[5:] == [len(lag), *2 * [len(lag) // 2, len(lag)]]
 
 
 @pytest.mark.parametrize("shape", [{}, {"components": ((0.2, 2.5, 1.0),)}])

@@ -127,18 +127,13 @@ class PulseFit(NamedTuple):
         return drawn / drawn.max()
 
 
-def fit_gaussians(
-    stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0, together: int = 1
-) -> list[PulseFit]:
+def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0) -> list[PulseFit]:
     """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more.
 
     One that gains less is kept where the next one after it makes up for both. Where one Gaussian reaches the goal, a
-    misfit in amplitudes, no more are fitted. together: lags whose mean is one where starts are compared.
+    misfit in amplitudes, no more are fitted.
     """
     weight = _weights(stack)
-    whole = len(weight) // together * together
-    means = [np.mean(column[:whole].reshape(-1, together), axis=1) for column in (*stack, weight)]
-    coarse, coarse_weight = Stack(*means[:3]), means[3]
     parameters = np.array([1.0, 0.0, width])
     fits: list[PulseFit] = []
     worth = 0
@@ -167,7 +162,7 @@ def fit_gaussians(
         ]
         sharper = np.r_[parameters, -0.2, parameters[1], 1.3 * around]
         sharper[0] += 0.2
-        parameters = _refine(coarse, coarse_weight, np.stack((*starts, sharper)), TRIAL_EVALUATIONS)
+        parameters = _refine(stack, weight, np.stack((*starts, sharper)), TRIAL_EVALUATIONS)
 
 
 def fit_skewed(stack: Stack, width: float) -> PulseFit:

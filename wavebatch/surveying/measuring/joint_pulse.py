@@ -38,10 +38,6 @@ STEP, TAIL_STEP = 0.07, 5.0
 """Steps of the lag at which the core is drawn [widths], also where they are a tenth of a sample: echoes lie anywhere
 between samples, and coarser steps do not see what the Gaussians miss. And those in the tail over them."""
 
-TOGETHER = 2
-"""Steps that are one where starts of a further Gaussian are compared: two fifths of the sigma of the narrowest. A drawn
-pulse has no noise, and is fitted in all steps afterwards. For a stack of samples noise would decide."""
-
 LEAST_CHANGE = 0.003
 """Least misfit that is expected of the strongest echoes, so that a few do not decide alone."""
 
@@ -90,7 +86,7 @@ def learn_jointly(
     if not len(half):  # of steps and other signal that is no echo nothing is learned
         return system
     width = float(half[-1] - half[0]) / FWHM_PER_SIGMA
-    fits = fit_gaussians(stack, width, together=TOGETHER)
+    fits = fit_gaussians(stack, width)
     missed = [float(np.mean((fit.draw(stack.lag) - stack.value) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
