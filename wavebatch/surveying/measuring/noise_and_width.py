@@ -57,6 +57,9 @@ ENOUGH_TO_LEARN = 20
 """Isolated echoes from which a pulse can be learned (R2): at SNR 20 their stack is known to a hundredth of its peak, a
 Gaussian misses the pulses of real sensors by two to six."""
 
+LEAST_BELOW = 10
+"""Echoes narrower than the pulse from which the scatter of widths is known, to a fourth of itself."""
+
 FIRST_WIDTH = 2.0
 """First guess of the system pulse's width [samples]."""
 
@@ -427,7 +430,7 @@ def measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable
     From those narrower than the system pulse, since slopes and plants only widen. echoes: of the block.
     """
     below = find_single(echoes, len(block), system) & (echoes.sigma < system.sigma_ref)
-    if np.count_nonzero(below) < ENOUGH_TO_LEARN:
+    if np.count_nonzero(below) < LEAST_BELOW:
         return 0.0
     lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
     excess = median(lack**2) / SQUARED_NORMAL_MEDIAN - median(echoes.sigma_err[below].astype(np.float64) ** 2)
