@@ -31,11 +31,13 @@ from wavebatch.kernels.geometry.group_returns import (
     match_returns,
     number_returns,
 )
+from wavebatch.surveying.look import kind_of
 
 if TYPE_CHECKING:
     from wavebatch.files.cloud.writer import OutputLayout
     from wavebatch.files.las.header import LasHeader
     from wavebatch.files.strip.reader import Unit
+    from wavebatch.surveying.systems.figures import Kind
 
 _REFLECTING = ("level_reflectance", "facing_reflectance")
 """Columns that no matt surface has above 1."""
@@ -128,10 +130,9 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     times_read = np.zeros(n, np.int64)
     direction, origin, digitizer = np.zeros((n, 3)), np.zeros((n, 3)), unit.packets.digitizer.copy()
     tables, nearest = [], [np.empty(0, np.int64)]
-    kinds: dict[tuple[float, ...], dict[int, int]] = {}
+    kinds: dict[Kind, dict[int, int]] = {}
     for block, index, table in results:
-        one = block.digitizer
-        lengths = kinds.setdefault((one.bits, one.spacing, one.gain, one.offset), {})
+        one, lengths = block.digitizer, kinds.setdefault(kind_of(block), {})
         lengths[one.index] = max(one.n_samples, lengths.get(one.index, 0))
         times_read += np.bincount(index, minlength=n)
         direction[index], origin[index] = block.direction, block.origin

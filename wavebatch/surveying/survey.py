@@ -17,7 +17,7 @@ from wavebatch.kernels.signal.defects import find_seam
 from wavebatch.stages.clean import clean_block, mark_seam, measure_defects
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
+from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, kind_of, pool_blocks, weigh
 from wavebatch.surveying.measuring.choose_pulse import JOINTLY, STACKED, SUMMED, bear, choose_pulse, learn_alone, settle
 from wavebatch.surveying.measuring.joint_pulse import LEAST_CHANGE
 from wavebatch.surveying.measuring.judge import SURE
@@ -52,7 +52,7 @@ from wavebatch.surveying.measuring.residuals import decompose_again, decompose_s
 from wavebatch.surveying.measuring.tails import find_parts, measure_beside, measure_tail
 from wavebatch.surveying.measuring.whitening import choose_whitening, lower_noise
 from wavebatch.surveying.predict_error import measure_hidden
-from wavebatch.surveying.systems.figures import Figures, describe_scene, note_counts
+from wavebatch.surveying.systems.figures import Figures, Kind, describe_scene, note_counts
 from wavebatch.surveying.systems.known_systems import MOST_DOUBTED, guess_width, list_known
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
@@ -94,11 +94,9 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True, errors
     places = {block.digitizer.n_samples: find_seam(block.samples) for block in joined}
     seams = {length: at for length, at in places.items() if at}
     # Descriptors that differ in length only are pooled, the largest first.
-    kinds: dict[tuple[float, ...], list[WaveformBlock]] = {}
+    kinds: dict[Kind, list[WaveformBlock]] = {}
     for block in joined:
-        digitizer = block.digitizer
-        kind = (digitizer.bits, digitizer.spacing, digitizer.gain, digitizer.offset)
-        kinds.setdefault(kind, []).append(mark_seam(block, seams))
+        kinds.setdefault(kind_of(block), []).append(mark_seam(block, seams))
     groups = [(pool_blocks(members), members) for members in kinds.values()]
     groups.sort(key=lambda group: weigh(group[0]), reverse=True)
     (main, members), *others = groups

@@ -542,13 +542,14 @@ def build_calibration(
         describe_channel(replace(row, relative_error=math.hypot(row.relative_error, ranging)), source)
         for row in _measure_channels(measured)
     )
-    # Channels differ in gain, so that no median of a target is common to them.
-    split: list[TargetResult] = []
-    for result, rows, constant in measured:
-        split += [result] if result.constant is None else []
-        for channel in np.unique(rows["channel"]).tolist():
-            which = f"digitizer {channel // SCANNERS}, scanner channel {channel % SCANNERS}"
-            split.append(replace(summarise(result, constant[rows["channel"] == channel]), channel=which))
+    shown = results
+    if len(channels) > 1:  # they differ in gain, so that no median of a target is common to them
+        shown = []
+        for result, rows, constant in measured:
+            shown += [result] if result.constant is None else []
+            for channel in np.unique(rows["channel"]).tolist():
+                which = f"digitizer {channel // SCANNERS}, scanner channel {channel % SCANNERS}"
+                shown.append(replace(summarise(result, constant[rows["channel"] == channel]), channel=which))
     # The constant of all together serves files of tools that know no channels; its error covers how far they differ.
     apart = float(np.std([row.constant for row in channels])) / whole.constant
     facts, pulse, where = source.reader.facts, source.system.sigma_ref, options.selection.where
@@ -573,7 +574,7 @@ def build_calibration(
         height=float(np.median(-used["ray"][:, 2] * used["distance"])),
         distance=float(np.median(used["distance"])),
         fingerprint=take_fingerprint(source.path, facts.packets.file),
-        targets=tuple(split if len(channels) > 1 else results),
+        targets=tuple(shown),
         channels=channels,
         **source.sent.describe(),
         bent=bent,

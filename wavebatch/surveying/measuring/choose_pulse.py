@@ -259,9 +259,10 @@ def choose_pulse(
     # Where too few echoes teach further, what lone echoes teach jointly stands for itself.
     tried = {one.name: one.system for one in hopeful if one.name != JOINTLY or not learned}
     tried |= {OF_ALL: own} if plain else {}
-    found = list(learned)
+    found: list[Candidate] = []
     for name, system in tried.items():
-        best, longer = min(found, key=lambda one: one.typical, default=None), ahead.get(name, 0.0)
+        best = min(learned + found, key=lambda one: one.typical, default=None)
+        longer = ahead.get(name, 0.0)
         # One that is far from the strip's takes five times as long: first the waveforms that would show it as hopeless.
         some = spread_rows(len(judged), int(FEWEST * ((HOPELESS + 1) / max(longer, 1.0)) ** 2))
         if best and name in given and 2 * len(some) < len(judged):
@@ -269,7 +270,7 @@ def choose_pulse(
             if exceed(length, best.length[some]) >= HOPELESS:
                 continue
         found.append(_judge(judged, name, system, CHANGES[1], known=name in given))
-    found = _try_changes(judged, found[len(learned) :] + learned)
+    found = _try_changes(judged, found + learned)
     choice = _decide(found, small=small)
     if choice.best.name in starts and not _is_as_wide(choice.best, begin):
         # Few waveforms showed another start: what was learned from it may be of another pulse.

@@ -112,13 +112,13 @@ def look_in_mirror(
         rest = other.take(np.flatnonzero(alone))
         energy = rest.amplitude * np.sqrt(rest.sigma) * unit
         near, far = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
-        down, up = energy[far], None
+        down = up = energy[far]
         # Only where it decides: the waveforms are decomposed once more.
         many = len(down) > FALSE_QUIET * len(echoes)
         if many or system.noise.quiet < FINE:
             own = find_echoes(block, system, detect, **options)[2]
             found = own.amplitude * np.sqrt(own.sigma) * unit
-            up = found if many else None
+            up = found if many else up
             if system.noise.quiet < FINE:
                 low = own.amplitude < STEP
                 steps.append((found[low], found[~low & (own.amplitude < 2 * STEP)]))
@@ -127,14 +127,11 @@ def look_in_mirror(
     for level in levels:
         quiet = max(int(np.count_nonzero(low >= level) - np.count_nonzero(high >= level)) for low, high in steps)
         for _, down, up in false:
-            number = int(np.count_nonzero(down >= level))
-            if up is not None:
-                # Noise makes no more than there are of that size, within a factor of two and an error: what only goes
-                # down makes none, as tails of echoes of 10,000 noises, far from them.
-                lower, upper = (np.frexp(one[one >= level] / (level or 1.0))[1] for one in (down, up))
-                pairs = [[np.count_nonzero(one == octave) for one in (lower, upper)] for octave in distinct(lower)]
-                number = int(sum(min(below, above + above**0.5) for below, above in pairs))
-            quiet = max(quiet, number)
+            # Noise makes no more than there are of that size, within a factor of two and an error: what only goes down
+            # makes none, as tails of echoes of 10,000 noises, far from them.
+            lower, upper = (np.frexp(one[one >= level] / (level or 1.0))[1] for one in (down, up))
+            pairs = [[np.count_nonzero(one == octave) for one in (lower, upper)] for octave in distinct(lower)]
+            quiet = max(quiet, int(sum(min(below, above + above**0.5) for below, above in pairs)))
         beside = max(int(np.count_nonzero(one >= level)) for one, _, _ in false)
         yield level, Mirror(len(mains), beside, int(np.count_nonzero(energy >= level)), quiet)
 
